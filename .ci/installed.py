@@ -1,0 +1,35 @@
+"""Checks an installed neuralq from outside the checkout: ``python installed.py WHEEL`` is silent if all is well."""
+
+from __future__ import annotations
+
+import sys
+import zipfile
+from pathlib import Path
+
+
+def main(wheel: str) -> None:
+    """Raises AssertionError for what does not belong into the wheel, or does not work once it is installed."""
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+    assert tops == {"neuralq", "neuralq_envs", "neuralq_plugin.pth"}, f"unexpected top-level names: {sorted(tops)}"
+    assert {"neuralq/py.typed", "neuralq_envs/py.typed"} <= set(names), "a py.typed is missing"
+    strays = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc"))]
+    assert not strays, f"caches in the wheel: {strays}"
+
+    import gymnasium
+
+    environment = gymnasium.make("neuralq/MitchellGrid-v0")  # before any import of neuralq: the point of the check
+    observation, _ = environment.reset(seed=0)
+    assert environment.observation_space.contains(observation)
+
+    import neuralq
+    import neuralq_envs
+
+    for module in (neuralq, neuralq_envs):
+        assert Path(sys.prefix) in Path(str(module.__file__)).parents, f"{module.__file__} is not the installed one"
+    for name in neuralq.__all__:
+        assert getattr(neuralq, name) is not None, name
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

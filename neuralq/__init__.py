@@ -1,0 +1,100 @@
+"""neuralq: value functions learned by any representation, beside the exact answer.
+
+``import neuralq`` is cheap. Each name and each submodule is loaded when it is first used, so PyTorch is imported only
+by what needs it, and ``neuralq --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False  # known to type checkers; importing `typing` would cost more than all the rest here
+if TYPE_CHECKING:
+    from neuralq import exact as exact
+    from neuralq import lab as lab
+    from neuralq import learners as learners
+    from neuralq import q as q
+    from neuralq import recipes as recipes
+    from neuralq import report as report
+    from neuralq import rules as rules
+    from neuralq.agent import load as load
+    from neuralq.mdp import FiniteMDP as FiniteMDP
+    from neuralq.q import ActionInputQ as ActionInputQ
+    from neuralq.q import ActionOutputQ as ActionOutputQ
+    from neuralq.q import LinearQ as LinearQ
+    from neuralq.q import SeparateQ as SeparateQ
+    from neuralq.q import TableQ as TableQ
+    from neuralq.replay import ReplayBuffer as ReplayBuffer
+    from neuralq.training import resume as resume
+    from neuralq.training import train as train
+    from neuralq.types import QFunction as QFunction
+    from neuralq.types import Transition as Transition
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ActionInputQ",
+    "ActionOutputQ",
+    "FiniteMDP",
+    "LinearQ",
+    "QFunction",
+    "ReplayBuffer",
+    "SeparateQ",
+    "TableQ",
+    "Transition",
+    "__version__",
+    "exact",
+    "lab",
+    "learners",
+    "load",
+    "q",
+    "recipes",
+    "report",
+    "resume",
+    "rules",
+    "train",
+]
+
+# Where each name lives. A name here must not be the name of a module of this package: importing the module would
+# rebind the name (hence neuralq/training.py, which holds `train`).
+_HOMES = {
+    "ActionInputQ": "neuralq.q",
+    "ActionOutputQ": "neuralq.q",
+    "FiniteMDP": "neuralq.mdp",
+    "LinearQ": "neuralq.q",
+    "QFunction": "neuralq.types",
+    "ReplayBuffer": "neuralq.replay",
+    "SeparateQ": "neuralq.q",
+    "TableQ": "neuralq.q",
+    "Transition": "neuralq.types",
+    "load": "neuralq.agent",
+    "resume": "neuralq.training",
+    "train": "neuralq.training",
+}
+
+
+if not TYPE_CHECKING:  # a type checker would believe that every name exists
+
+    def __getattr__(name: str) -> object:
+        """Loads a public name, or any submodule, at its first use.
+
+        Raises:
+            AttributeError: when there is neither.
+        """
+        from importlib import import_module
+
+        if name in _HOMES:
+            value: object = getattr(import_module(_HOMES[name]), name)
+            globals()[name] = value
+            return value
+        if not name.startswith("_"):
+            module = f"{__name__}.{name}"
+            try:
+                return import_module(module)
+            except ModuleNotFoundError as error:
+                if error.name != module:  # it exists, but something that it needs does not
+                    raise
+        raise AttributeError(f"module 'neuralq' has no attribute {name!r}; its public names are {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return sorted(__all__)

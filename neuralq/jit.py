@@ -1,0 +1,90 @@
+"""One decorator for every compiled kernel, so that all of them compile alike and none depends on a writable folder.
+
+Kernels release the GIL, divide as NumPy does (no ZeroDivisionError) and keep IEEE arithmetic: no reordering, so a
+run gives the same bits whatever the compiler vectorises. The compiled code is kept between processes (in the
+package's ``__pycache__``, the user's cache folder, or ``NUMBA_CACHE_DIR``); where no such folder can be written the
+kernel is compiled anew in each process, which costs seconds and is said once on stderr. A shared folder such as
+``/tmp`` is deliberately not used instead: the cache holds executable code, and a predictable path that others can
+write would let them plant theirs.
+
+The cache notices a change of the file that holds a kernel, not of kernels it calls in other files; delete
+``__pycache__`` after editing a kernel that another module's kernel calls.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+
+__all__ = ["kernel", "reassociating_kernel"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_njit: Any = numba.njit
+_said = False
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """The same function compiled to machine code at its first call, and cached on disk where that is possible.
+
+    Example:
+        >>> import numpy as np
+        >>> @kernel
+        ... def total(x: np.ndarray) -> float:
+        ...     result = 0.0
+        ...     for value in x:
+        ...         result += value
+        ...     return result
+        >>> total(np.arange(4.0))
+        6.0
+    """
+    return _compile(function, fastmath=False)
+
+
+def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, but sums may be added in another order, so that they vectorise.
+
+    The order is fixed when the kernel is compiled: on one machine the same input still gives the same bits. NaN and
+    infinity keep their meaning.
+
+    Example:
+        >>> import numpy as np
+        >>> @reassociating_kernel
+        ... def total(x: np.ndarray) -> float:
+        ...     result = 0.0
+        ...     for value in x:
+        ...         result += value
+        ...     return result
+        >>> total(np.arange(4.0))
+        6.0
+    """
+    return _compile(function, fastmath={"reassoc", "contract", "nsz", "arcp"})
+
+
+def _compile(function: Callable[P, R], fastmath: bool | set[str]) -> Callable[P, R]:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    try:
+        compiled = _njit(cache=True, **options)(function)
+    except RuntimeError as error:  # numba: "cannot cache function ...: no locator available for file ..."
+        if "cannot cache function" not in str(error):
+            raise
+        _say_once(function.__code__.co_filename)
+        compiled = _njit(cache=False, **options)(function)
+    return cast("Callable[P, R]", compiled)
+
+
+def _say_once(filename: str) -> None:
+    """One line on stderr per process; not for functions without a file (an interpreter prompt, a doctest)."""
+    global _said
+    if _said or filename.startswith("<"):
+        return
+    _said = True
+    print(
+        "neuralq: no writable folder for compiled kernels, so they are compiled anew in each process (some seconds); "
+        "set NUMBA_CACHE_DIR to a folder of yours that can be written",
+        file=sys.stderr,
+    )

@@ -1,0 +1,26 @@
+"""What all tests share: one thread per process, and property tests that draw the same examples every time."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import settings
+
+# Several test processes share few cores, and single-threaded sums are the same bits on every machine.
+torch.set_num_threads(1)
+
+# The same examples in every run: a failure is the change's fault, never the day's. No deadline: kernels compile once.
+settings.register_profile("house", derandomize=True, max_examples=25, deadline=None, database=None)
+settings.load_profile("house")
+
+# Shapes: annotations of jaxtyping are checked by beartype in tests only. The hook has to be installed before the first
+# import of a module that it is to check, so it belongs here, above every import of neuralq:
+#     jaxtyping.install_import_hook(["neuralq.rules"], "beartype.beartype")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests marked ``gpu`` are skipped where torch finds no accelerator."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu") is not None:
+                item.add_marker(pytest.mark.skip(reason="no accelerator that torch can use"))
