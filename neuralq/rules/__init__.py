@@ -1,0 +1,60 @@
+"""The rules of value learning as pure functions of tensors: no modules, no environments, nothing detached, no state.
+
+Subscripts: ``_tm1`` belongs to the state that was left, ``_t`` to the state that was reached. `discount_t` is γ, or 0
+where the world terminated; `last_t` is true where the stream of experience breaks. Shapes: ``[*n]`` are any leading
+axes, time first (``[T, *n]``) for returns; action values are ``[*n, A]`` with -∞ for illegal actions.
+"""
+
+from __future__ import annotations
+
+from neuralq.rules.episodes import forward_episode_update, reverse_episode_update
+from neuralq.rules.losses import huber, residual_gradient_error, semi_gradient_error, squared
+from neuralq.rules.policies import epsilon_greedy, greedy, greedy_random_ties, k_to_the_q, sample, softmax
+from neuralq.rules.returns import is_greedy, lambda_returns, n_step_returns, watkins_lambda
+from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
+from neuralq.rules.targets import (
+    double_q,
+    expected_sarsa,
+    expected_value,
+    one_step,
+    q_learning,
+    sarsa,
+    weighted_value,
+)
+from neuralq.rules.traces import accumulate, cut, dutch, replace, true_online_increment
+
+__all__ = [
+    "Constant",
+    "Exponential",
+    "Linear",
+    "Power",
+    "Schedule",
+    "accumulate",
+    "cut",
+    "double_q",
+    "dutch",
+    "epsilon_greedy",
+    "expected_sarsa",
+    "expected_value",
+    "forward_episode_update",
+    "greedy",
+    "greedy_random_ties",
+    "huber",
+    "is_greedy",
+    "k_to_the_q",
+    "lambda_returns",
+    "n_step_returns",
+    "one_step",
+    "q_learning",
+    "replace",
+    "residual_gradient_error",
+    "reverse_episode_update",
+    "sample",
+    "sarsa",
+    "semi_gradient_error",
+    "softmax",
+    "squared",
+    "true_online_increment",
+    "watkins_lambda",
+    "weighted_value",
+]

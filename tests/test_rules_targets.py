@@ -1,0 +1,170 @@
+"""One-step targets and table updates in a given order, against hand arithmetic.
+
+Mutants that these tests kill: double Q-learning with selector and value exchanged; the maximum over illegal actions as
+0 (wrong where all values are negative); 0 · -∞ = NaN at a terminal successor, in the value and in its derivative;
+expected Sarsa as a plain mean; reverse order run forwards; the input table written in place.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from neuralq import rules
+
+INF = torch.inf
+Q_T = torch.tensor([[1.0, 4.0, 2.0], [-1.0, -3.0, -INF], [-INF, -INF, -INF]])
+R_T = torch.tensor([1.0, 1.0, 1.0])
+DISCOUNT_T = torch.tensor([0.5, 0.5, 0.0])
+
+
+def test_q_learning_by_hand() -> None:
+    # 1 + .5·4, 1 + .5·(-1), nothing legal and terminal: the reward
+    assert rules.q_learning(R_T, DISCOUNT_T, Q_T).tolist() == [3.0, 0.5, 1.0]
+
+
+def test_double_q_by_hand() -> None:
+    selector = torch.tensor([[0.0, 1.0, 9.0], [0.0, 1.0, -INF], [-INF, -INF, -INF]])
+    # the selector picks actions 2 and 1: 1 + .5·2, 1 + .5·(-3)
+    assert rules.double_q(R_T, DISCOUNT_T, Q_T, selector).tolist() == [2.0, -0.5, 1.0]
+
+
+def test_double_q_takes_the_lowest_index_on_ties() -> None:
+    target = rules.double_q(torch.tensor(0.0), torch.tensor(1.0), torch.tensor([5.0, 7.0]), torch.tensor([3.0, 3.0]))
+    assert target.item() == 5.0
+
+
+def test_expected_sarsa_by_hand() -> None:
+    pi = torch.tensor([[0.5, 0.25, 0.25], [0.5, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    # 1 + .5·(.5 + 1 + .5), 1 + .5·(-2)
+    assert rules.expected_sarsa(R_T, DISCOUNT_T, Q_T, pi).tolist() == [2.0, 0.0, 1.0]
+    uniform = torch.full((3, 3), 1 / 3)  # a policy that puts mass on the terminal state's actions does no harm there
+    assert rules.expected_sarsa(R_T, DISCOUNT_T, Q_T, uniform)[2].item() == 1.0
+
+
+def test_sarsa_by_hand() -> None:
+    assert rules.sarsa(R_T, DISCOUNT_T, Q_T, torch.tensor([2, 1, 0])).tolist() == [2.0, -0.5, 1.0]
+
+
+def test_a_dead_end_that_is_not_terminal_is_seen() -> None:
+    half = torch.full((3,), 0.5)
+    assert rules.q_learning(R_T, half, Q_T)[2].item() == -INF
+
+
+def test_a_nan_is_never_hidden() -> None:
+    nan = torch.full((1, 2), torch.nan)
+    assert rules.q_learning(torch.ones(1), torch.zeros(1), nan).isnan().all()
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_step(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Rewards, discounts (some 0) and action values (some illegal, never all) of 5 × 2 steps and 4 actions."""
+    g = torch.Generator().manual_seed(seed)
+    r, discount = (torch.rand(5, 2, generator=g, dtype=torch.float64) for _ in range(2))
+    q = torch.randn(5, 2, 4, generator=g, dtype=torch.float64)
+    illegal = torch.rand(5, 2, 4, generator=g) < 0.4
+    illegal[..., 0] = False
+    return r, discount.masked_fill(torch.rand(5, 2, generator=g) < 0.3, 0.0), q.masked_fill(illegal, -INF)
+
+
+@given(seeds)
+def test_greedy_expectation_is_q_learning(seed: int) -> None:
+    r, discount, q = random_step(seed)
+    best = rules.q_learning(r, discount, q)
+    for policy in (rules.greedy(q), rules.greedy_random_ties(q), rules.k_to_the_q(q, 1e300)):
+        assert (rules.expected_sarsa(r, discount, q, policy) <= best + 1e-9).all()
+    torch.testing.assert_close(rules.expected_sarsa(r, discount, q, rules.greedy(q)), best)
+    torch.testing.assert_close(rules.sarsa(r, discount, q, q.argmax(-1)), best)
+    torch.testing.assert_close(rules.double_q(r, discount, q, q), best)
+
+
+@given(seeds)
+def test_q_learning_contracts_by_the_discount(seed: int) -> None:
+    r, discount, q = random_step(seed)
+    other = q + torch.randn(q.shape, generator=torch.Generator().manual_seed(seed + 1), dtype=q.dtype)
+    gap = (rules.q_learning(r, discount, q) - rules.q_learning(r, discount, other)).abs()
+    legal_change = (q - other).nan_to_num(0.0).abs().amax(-1)
+    assert (gap <= discount * legal_change + 1e-12).all()
+
+
+def test_derivatives_are_finite_beside_illegal_actions() -> None:
+    q = Q_T.clone().requires_grad_()
+    pi = torch.tensor([[0.5, 0.25, 0.25], [0.5, 0.5, 0.0], [0.0, 0.0, 0.0]], requires_grad=True)
+    rules.q_learning(R_T, DISCOUNT_T, q).sum().backward()
+    assert q.grad is not None
+    assert q.grad.tolist() == [[0.0, 0.5, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    q.grad = None
+    rules.expected_sarsa(R_T, DISCOUNT_T, q, pi).sum().backward()
+    assert torch.equal(q.grad, DISCOUNT_T[:, None] * pi.detach())
+    assert pi.grad is not None and pi.grad.isfinite().all()
+
+
+def test_mismatched_shapes_are_refused() -> None:
+    ones = torch.ones(3)
+    for call, message in [
+        (lambda: rules.q_learning(ones, ones, torch.ones(3, 1, 2)), "v_t must have the shape of r_t"),
+        (lambda: rules.q_learning(ones, ones[:, None], torch.ones(3, 2)), "discount_t must have the shape"),
+        (lambda: rules.sarsa(ones, ones, torch.ones(3, 2), torch.zeros(3)), "int64"),
+        (lambda: rules.sarsa(ones, ones, torch.ones(3, 2), torch.zeros(3, 1).long()), "leading axes"),
+        (lambda: rules.expected_sarsa(ones, ones, torch.ones(3, 2), torch.ones(2)), "pi must have the shape"),
+        (lambda: rules.double_q(ones, ones, torch.ones(3, 2), torch.ones(3, 1)), "q_t_selector"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+# --------------------------------------------------------------------------------- the order of updates in an episode
+
+PATH = torch.tensor([0, 1, 2])
+RIGHT = torch.tensor([0, 0, 0])
+REWARDS = torch.tensor([0.0, 0.0, 100.0])
+CORRIDOR = (PATH, RIGHT, REWARDS, torch.tensor([0.9, 0.9, 0.0]), PATH + 1)
+
+
+def test_reverse_order_carries_the_reward_along_the_whole_path() -> None:
+    """Mitchell 13.3.6: backwards one episode fills the path (100, 90, 81), forwards it moves one entry per episode."""
+    table = torch.zeros(4, 1)
+    assert rules.reverse_episode_update(table, *CORRIDOR)[:, 0].tolist() == pytest.approx([81, 90, 100, 0])
+    seen = []
+    for _ in range(3):
+        table = rules.forward_episode_update(table, *CORRIDOR)
+        seen.append(table[:3, 0].tolist())
+    assert seen[0] == pytest.approx([0, 0, 100])
+    assert seen[1] == pytest.approx([0, 90, 100])
+    assert seen[2] == pytest.approx([81, 90, 100])
+
+
+def test_step_size_by_hand() -> None:
+    """α = ½ from zeros: 50; then ½·.9·50 = 22.5; then ½·.9·22.5 = 10.125. The table handed in is not written."""
+    table = torch.zeros(4, 1)
+    assert rules.reverse_episode_update(table, *CORRIDOR, step_size=0.5)[:, 0].tolist() == [10.125, 22.5, 50.0, 0.0]
+    assert table.eq(0).all()
+
+
+def test_a_repeated_pair_is_updated_twice_and_illegal_actions_stay() -> None:
+    """The loop 0 → 0 → goal: backwards first q = 10, then 1 + .5·10 = 6 overwrites it; forwards the other way round."""
+    table = torch.tensor([[0.0, -INF], [-INF, -INF]])
+    twice = torch.tensor([0, 0])
+    episode = (twice, twice, torch.tensor([1.0, 10.0]), torch.tensor([0.5, 0.0]), torch.tensor([0, 1]))
+    assert rules.reverse_episode_update(table, *episode).tolist() == [[6.0, -INF], [-INF, -INF]]
+    assert rules.forward_episode_update(table, *episode).tolist() == [[10.0, -INF], [-INF, -INF]]
+
+
+def test_order_rules_are_differentiable() -> None:
+    table = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    episode = tuple(x.double() if x.is_floating_point() else x for x in CORRIDOR)
+    assert torch.autograd.gradcheck(lambda q: rules.reverse_episode_update(q, *episode, 0.5), (table,))
+
+
+def test_an_episode_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="one episode"):
+        rules.reverse_episode_update(torch.zeros(4, 1), *(x[:, None] for x in CORRIDOR))
+    with pytest.raises(ValueError, match="step_size must lie"):
+        rules.reverse_episode_update(torch.zeros(4, 1), *CORRIDOR, step_size=2.0)
+    with pytest.raises(ValueError, match="s_t must have the shape"):
+        rules.reverse_episode_update(torch.zeros(4, 1), *CORRIDOR[:4], PATH[:2])
