@@ -1,0 +1,113 @@
+"""ε-greedy action selection for a batch, compiled: what `rules.sample(rules.epsilon_greedy(q, ε), u)` gives, in one pass.
+
+Acting happens at every environment step, and as tensor operations it would cost more than a small environment. The rule
+stays the definition; tests/test_acting.py holds this to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq.jit import kernel
+
+__all__ = ["choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+@kernel
+def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -> int:
+    """Fill ``actions`` and ``mu``; returns the first row without a usable action value, or −1."""
+    rows, num_actions = q.shape
+    for i in range(rows):
+        best, num_legal = -1, 0
+        for j in range(num_actions):
+            if q[i, j] != q[i, j]:
+                return i
+            if q[i, j] > -np.inf:
+                num_legal += 1
+                if best < 0 or q[i, j] > q[i, best]:
+                    best = j
+        if best < 0:
+            return i
+        each = epsilon / num_legal
+        # Inverse distribution function over the legal actions in index order.
+        reached, chosen, left = 0.0, best, u[i]
+        for j in range(num_actions):
+            if q[i, j] > -np.inf:
+                mass = each + (1.0 - epsilon if j == best else 0.0)
+                reached += mass
+                if mass > 0 and left < reached:
+                    chosen = j
+                    break
+        actions[i] = chosen
+        mu[i] = each + (1.0 - epsilon if chosen == best else 0.0)
+    return -1
+
+
+def choose_epsilon_greedy(q: Tensor, epsilon: float, u: _Array) -> tuple[Tensor, Tensor]:
+    """ε-greedy actions and the probability of each.
+
+    Args:
+        q: action values ``[N, A]``, −∞ for illegal actions.
+        epsilon: in [0, 1]; its mass is spread over the legal actions, the greedy one included. Ties go to the lowest index.
+        u: uniform numbers in [0, 1), ``[N]`` float64.
+
+    Returns:
+        Actions ``[N]`` int64 and their probabilities ``[N]`` float32, on the CPU.
+
+    Raises:
+        ValueError: if a row holds NaN or no legal action: the learner has diverged, or the environment gave an empty mask.
+
+    Example:
+        >>> a, mu = choose_epsilon_greedy(torch.tensor([[0.0, 2.0]]), 0.5, np.array([0.9]))
+        >>> a.tolist(), mu.tolist()
+        ([1], [0.75])
+    """
+    values = q.detach().cpu().numpy()
+    actions = np.empty(len(values), np.int64)
+    mu = np.empty(len(values), np.float32)
+    row = _choose(values, epsilon, u, actions, mu)
+    if row >= 0:
+        raise ValueError(
+            f"cannot choose an action in environment {row} from the values {values[row].tolist()}: NaN means that "
+            "training diverged (try a smaller step size), all −inf that the action mask allows nothing"
+        )
+    return torch.from_numpy(actions), torch.from_numpy(mu)
+
+
+def choose_greedy(q: Tensor) -> tuple[Tensor, Tensor]:
+    """Greedy actions ``[N]`` and probability one for each; ties go to the lowest index.
+
+    Example:
+        >>> choose_greedy(torch.tensor([[1.0, 1.0], [0.0, 3.0]]))[0].tolist()
+        [0, 1]
+    """
+    return choose_epsilon_greedy(q, 0.0, np.zeros(len(q)))
+
+
+def epsilon_greedy_policy(
+    values: Callable[[Tensor], Tensor], epsilon: Callable[[], float], rng: np.random.Generator
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """A policy that draws from ``rng`` and looks up ε at every step.
+
+    Args:
+        values: observations ``[N, *obs]`` to action values ``[N, A]``.
+        epsilon: the present ε, usually a schedule of a counter.
+        rng: drawn from once per environment and step.
+
+    Example:
+        >>> policy = epsilon_greedy_policy(lambda s: -s, lambda: 0.0, np.random.default_rng(0))
+        >>> policy(torch.tensor([[1.0, 0.0]]))[0].tolist()
+        [1]
+    """
+
+    def policy(s: Tensor) -> tuple[Tensor, Tensor]:
+        return choose_epsilon_greedy(values(s), epsilon(), rng.random(len(s)))
+
+    return policy

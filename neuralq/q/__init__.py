@@ -1,0 +1,24 @@
+"""Representations of action values: a table, linear features and the three network layouts of Mitchell (1997), §13.6.
+
+Every class here is a `neuralq.types.QFunction`: ``all(s)`` gives the values of every action, ``at(s, a)`` those of the
+actions named, and the second always equals the first gathered at ``a``. What differs is which estimates one update moves
+along with the one it was meant for, and that is what decides whether training converges.
+"""
+
+from neuralq.q.bodies import MLP, Conv
+from neuralq.q.exact_case import LinearQ, TableQ
+from neuralq.q.flat import FlatParameters
+from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
+from neuralq.q.masked import MaskedQ
+
+__all__ = [
+    "MLP",
+    "ActionInputQ",
+    "ActionOutputQ",
+    "Conv",
+    "FlatParameters",
+    "LinearQ",
+    "MaskedQ",
+    "SeparateQ",
+    "TableQ",
+]

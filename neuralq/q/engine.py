@@ -1,0 +1,277 @@
+"""Engines: who computes values and gradients for a learner, and on which code path.
+
+`TorchEngine` runs any `QFunction` through autograd on any device. `MlpEngine` runs the three layouts with an MLP body on a
+CPU through compiled kernels on the same flat parameters; it is chosen automatically where it applies. Learners see no
+difference but speed: both are held to each other by tests.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuralq.checks import check_choice, check_positive
+from neuralq.q import mlp_kernels as kernels
+from neuralq.q.bodies import ACTIVATIONS, Trunk
+from neuralq.q.flat import FlatParameters
+from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
+from neuralq.q.masked import MaskedQ
+from neuralq.types import QFunction
+
+__all__ = ["Engine", "Loss", "MlpEngine", "TorchEngine", "make_engine", "runs_compiled"]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Squared or Huber loss of the error target − Q(s, a), weighted per sample and averaged.
+
+    Args:
+        kind: "squared" (½e²) or "huber" (½e² up to ``delta``, then linear).
+        delta: where Huber's loss turns linear; unused by "squared".
+    """
+
+    kind: str = "squared"
+    delta: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse unknown kinds and a threshold that is not positive."""
+        check_choice("loss", self.kind, ("squared", "huber"))
+        check_positive("delta", self.delta)
+
+
+class Engine(Protocol):
+    """What a learner needs of a representation: values, and gradients into one flat vector."""
+
+    q: QFunction
+    flat: FlatParameters
+
+    def all(self, s: Tensor, target: bool = False) -> Tensor:
+        """Action values ``[*n, A]`` without gradient; ``target`` asks the target copy."""
+        ...
+
+    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Errors target − Q(s, a) ``[B]``; leaves the mean loss's gradient in ``flat.grad``."""
+        ...
+
+    def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
+        """Q(s, a) ``[]`` of one state and action; leaves its gradient in ``flat.grad``."""
+        ...
+
+    def sync_target(self) -> None:
+        """Copy the parameters into the target copy (made at the first call)."""
+        ...
+
+    def target_values(self) -> Tensor | None:
+        """The target copy's flat vector, or None where there is none."""
+        ...
+
+
+class TorchEngine:
+    """Autograd on any module and device.
+
+    Args:
+        q: the representation; its parameters become views of one flat vector.
+        loss: squared or Huber.
+    """
+
+    def __init__(self, q: QFunction, loss: Loss) -> None:
+        self.q = q
+        self.loss = loss
+        self.flat = FlatParameters(cast(nn.Module, q))
+        self._target: QFunction | None = None
+        self._target_flat: FlatParameters | None = None
+
+    @torch.no_grad()
+    def all(self, s: Tensor, target: bool = False) -> Tensor:
+        """Action values without gradient, of the target copy if asked for."""
+        return cast(QFunction, self._target if target else self.q).all(s)
+
+    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
+        self.flat.grad.zero_()
+        error = target.to(self.flat.values.dtype) - self.q.at(s, a)
+        if self.loss.kind == "squared":
+            each = 0.5 * error * error
+        else:
+            each = nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=self.loss.delta)
+        (each if weight is None else each * weight).mean().backward()  # type: ignore[no-untyped-call]
+        return error.detach()
+
+    def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
+        """Value of one pair and, in ``flat.grad``, its gradient."""
+        self.flat.grad.zero_()
+        q = self.q.at(s, a)
+        q.backward()  # type: ignore[no-untyped-call]
+        return q.detach()
+
+    def sync_target(self) -> None:
+        """Copy the parameters into the target copy."""
+        if self._target_flat is None:
+            target = copy.deepcopy(cast(nn.Module, self.q))
+            self._target, self._target_flat = cast(QFunction, target), FlatParameters(target)
+        self._target_flat.values.copy_(self.flat.values)
+
+    def target_values(self) -> Tensor | None:
+        """The target copy's flat vector, or None."""
+        return None if self._target_flat is None else self._target_flat.values
+
+
+def runs_compiled(q: Any) -> bool:
+    """Whether `MlpEngine` knows this module: one of the three layouts, an MLP body, on a CPU, float32 or float64."""
+    inner = q.inner if type(q) is MaskedQ else q
+    if type(inner) not in (ActionOutputQ, SeparateQ, ActionInputQ) or type(inner.trunk) is not Trunk:
+        return False
+    first = next(inner.parameters())
+    return inner.input.stem is None and first.device.type == "cpu" and first.dtype in (torch.float32, torch.float64)
+
+
+class MlpEngine:
+    """Compiled passes over the flat parameters of the three layouts with an MLP body.
+
+    Args:
+        q: one of the three layouts (or one under `MaskedQ`) for which `runs_compiled` is true.
+        loss: squared or Huber.
+    """
+
+    def __init__(self, q: QFunction, loss: Loss) -> None:
+        if not runs_compiled(q):
+            raise ValueError(f"no compiled kernels for {type(q).__name__} as it is; use the torch engine")
+        self.q = q
+        self.flat = FlatParameters(cast(nn.Module, q))
+        self._mask = q if isinstance(q, MaskedQ) else None
+        net = cast(Any, q.inner if isinstance(q, MaskedQ) else q)
+        self._net = net
+        self._num_actions: int = net.num_actions
+        self._layout = {ActionOutputQ: kernels.ACTION_OUTPUT, SeparateQ: kernels.SEPARATE}.get(
+            type(net), kernels.ACTION_INPUT
+        )
+        self._activation = list(ACTIVATIONS).index(net.trunk.activation)
+        self._loss = kernels.HUBER if loss.kind == "huber" else kernels.SQUARED
+        self._delta = loss.delta
+        self._plain_input = self._mask is None and net.input.features is None
+        self._dtype: torch.dtype = self.flat.values.dtype
+        self._plan, self._starts = _plan_of(net, self.flat)
+        self._width: int = net.input.num_features
+        self._values = self.flat.values.numpy()
+        self._grad = self.flat.grad.numpy()
+        self._target: Tensor | None = None
+        self._capacity = 0
+        self._reserve(1)
+
+    def _reserve(self, rows: int) -> None:
+        """Workspaces for that many samples; torch's allocator aligns them, which keeps BLAS reproducible."""
+        if rows <= self._capacity:
+            return
+        self._capacity = rows
+        wide = rows * (self._num_actions if self._layout == kernels.ACTION_INPUT else 1)
+        total = int(self._starts[-1] + self._plan[-1, 1])
+
+        def space(size: int) -> Any:
+            return torch.zeros(size, dtype=self._dtype).numpy()
+
+        self._acts, self._hats, self._deltas = space(wide * total), space(wide * total), space(wide * total)
+        self._inverse = space(wide * len(self._plan))
+        self._pairs = space(wide * (self._width + self._num_actions))
+        self._ones = torch.ones(rows, dtype=self._dtype).numpy()
+
+    def _rows(self, s: Tensor) -> tuple[Any, tuple[int, ...]]:
+        if self._plain_input:
+            shape = self._net.input.input_shape
+            leading = tuple(s.shape[: s.dim() - len(shape)])
+            if s.dtype != self._dtype:
+                s = s.to(self._dtype)
+            rows = s.numpy().reshape(-1, self._width)
+        else:
+            obs = s if self._mask is None else self._mask.observation(s)
+            x, size = self._net.input.rows(obs)
+            leading, rows = tuple(size), x.reshape(-1, self._width).numpy()
+        self._reserve(rows.shape[0])
+        return np.ascontiguousarray(rows), leading
+
+    def all(self, s: Tensor, target: bool = False) -> Tensor:
+        """Action values without gradient, of the target copy if asked for."""
+        x, leading = self._rows(s)
+        out = np.empty((x.shape[0], self._num_actions), x.dtype)
+        values = cast(Tensor, self._target).numpy() if target else self._values
+        kernels.all_values(
+            values, self._plan, self._starts, self._layout, self._num_actions, self._activation, x,
+            self._acts, self._hats, self._inverse, self._pairs, out,
+        )  # fmt: skip
+        q = torch.from_numpy(out).view(*leading, self._num_actions)
+        return q if self._mask is None else q.masked_fill_(self._mask.illegal(s), -torch.inf)
+
+    def _pull(self, s: Tensor, a: Tensor, target: Any, weight: Any, loss: int) -> Any:
+        x, _ = self._rows(s)
+        actions = a.reshape(-1).numpy()
+        if actions.size != x.shape[0]:
+            raise ValueError(f"got {x.shape[0]} states and {actions.size} actions; they must pair up")
+        if actions.size and not 0 <= actions.min() <= actions.max() < self._num_actions:
+            raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions.min()}..{actions.max()}")
+        q = np.empty(x.shape[0], x.dtype)
+        kernels.pull(
+            self._values, self._grad, self._plan, self._starts, self._layout, self._num_actions, self._activation,
+            x, actions, q if target is None else target, self._ones[: x.shape[0]] if weight is None else weight,
+            loss, self._delta, self._acts, self._hats, self._inverse, self._deltas, self._pairs, q,
+        )  # fmt: skip
+        return q
+
+    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
+        wanted = target.to(self._dtype).contiguous().numpy()
+        weights = None if weight is None else weight.to(self._dtype).contiguous().numpy()
+        return torch.from_numpy(wanted - self._pull(s, a, wanted, weights, self._loss))
+
+    def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
+        """Value of one pair and, in ``flat.grad``, its gradient."""
+        return torch.from_numpy(self._pull(s, a, None, None, kernels.VALUE))[0]
+
+    def sync_target(self) -> None:
+        """Copy the parameters into the target copy."""
+        if self._target is None:
+            self._target = torch.empty_like(self.flat.values)
+        self._target.copy_(self.flat.values)
+
+    def target_values(self) -> Tensor | None:
+        """The target copy's flat vector, or None."""
+        return self._target
+
+
+def _plan_of(net: Any, flat: FlatParameters) -> tuple[Any, Any]:
+    """One row per layer with its sizes and offsets, and where each layer's block starts in a one-row workspace."""
+    base = flat.values.data_ptr()
+    size = flat.values.element_size()
+
+    def offset(parameter: Tensor) -> int:
+        return (parameter.data_ptr() - base) // size
+
+    plan = []
+    for i, layer in enumerate(net.trunk.layers):
+        _, fan_in, fan_out = layer.weight.shape
+        norm = net.trunk.norms[i] if i < len(net.trunk.norms) else None
+        scale, shift = (-1, -1) if norm is None else (offset(norm.weight), offset(norm.bias))
+        plan.append((fan_in, fan_out, offset(layer.weight), offset(layer.bias), scale, shift))
+    table = np.array(plan, dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(table[:-1, 1])]).astype(np.int64)
+    return table, starts
+
+
+def make_engine(q: QFunction, loss: Loss, kind: str = "auto") -> Engine:
+    """The engine for a representation: compiled where it applies, autograd otherwise.
+
+    Args:
+        q: the representation.
+        loss: squared or Huber.
+        kind: "auto", "torch" or "compiled".
+
+    Raises:
+        ValueError: for "compiled" where there are no kernels for ``q``.
+    """
+    check_choice("engine", kind, ("auto", "torch", "compiled"))
+    if kind == "compiled" or (kind == "auto" and runs_compiled(q)):
+        return MlpEngine(q, loss)
+    return TorchEngine(q, loss)

@@ -1,0 +1,55 @@
+"""Legal actions as part of the state: an observation with its action mask in one vector."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from neuralq.types import QFunction
+
+__all__ = ["MaskedQ"]
+
+
+class MaskedQ(nn.Module):
+    """A Q-function over observations that carry their action mask: illegal actions are worth −∞.
+
+    The masked observation is one vector ``[d + A]``: the flattened observation, then 1 for each legal action and 0 for
+    each illegal one. Every maximum, softmax and expectation of `neuralq.rules` copes with −∞, so nothing else needs to
+    know that masks exist.
+
+    Args:
+        inner: Q-function over the observation alone.
+        observation_shape: shape of that observation; ``()`` for a state index.
+
+    Example:
+        >>> from neuralq.q import TableQ
+        >>> q = MaskedQ(TableQ(3, 2), observation_shape=())
+        >>> q.all(torch.tensor([[2, 1, 0]]))
+        tensor([[0., -inf]], dtype=torch.float64, grad_fn=<MaskedFillBackward0>)
+    """
+
+    def __init__(self, inner: QFunction, observation_shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.inner = inner
+        self.num_actions = inner.num_actions
+        self.observation_shape = tuple(observation_shape)
+        self.width = math.prod(self.observation_shape)
+
+    def observation(self, s: Tensor) -> Tensor:
+        """The observation without its mask: ``[*n, d + A] -> [*n, *obs]``."""
+        return s[..., : self.width].reshape(*s.shape[:-1], *self.observation_shape)
+
+    def illegal(self, s: Tensor) -> Tensor:
+        """Which actions are not legal: ``[*n, d + A] -> [*n, A]`` bool."""
+        return s[..., self.width :] == 0
+
+    def all(self, s: Tensor) -> Tensor:
+        """Action values, −∞ where illegal: ``[*n, d + A] -> [*n, A]``."""
+        return self.inner.all(self.observation(s)).masked_fill(self.illegal(s), -torch.inf)
+
+    def at(self, s: Tensor, a: Tensor) -> Tensor:
+        """Values of the given actions, −∞ where illegal: ``([*n, d + A], [*n] int64) -> [*n]``."""
+        q = self.inner.at(self.observation(s), a)
+        return q.masked_fill(self.illegal(s).gather(-1, a[..., None])[..., 0], -torch.inf)

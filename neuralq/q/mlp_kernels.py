@@ -1,0 +1,330 @@
+"""Forward and backward passes of the plain MLP layouts, compiled, on the flat parameter vector.
+
+A small network on a CPU is bound by the framework's cost per operation, not by arithmetic: at 2x64 units and a batch of
+64, autograd spends most of its time between kernels. Here one call does a whole pass. The code is held to autograd by
+tests/test_engine.py for every layout, loss, activation and normalisation.
+
+The network is described by ``plan``, one row per layer: fan_in, fan_out, and the offsets in the flat vector of weight
+``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none). Workspaces hold
+for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the normalised pre-activation, ``deltas`` the
+gradient with respect to it; ``inverse`` holds 1/σ of each row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import scipy.linalg.cython_blas  # noqa: F401  (np.dot in kernels uses it; loaded here, thread limits set later reach it)
+
+from neuralq.jit import reassociating_kernel
+
+__all__ = ["ACTION_INPUT", "ACTION_OUTPUT", "HUBER", "SEPARATE", "SQUARED", "VALUE", "all_values", "pull"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+ACTION_OUTPUT, SEPARATE, ACTION_INPUT = 0, 1, 2
+SQUARED, HUBER, VALUE = 0, 1, 2
+_LAYER_NORM_EPS = 1e-5  # torch.nn.functional.layer_norm's default
+
+
+@reassociating_kernel
+def _activate(v: float, activation: int) -> float:
+    if activation == 0:
+        return v if v > 0 else v * 0
+    if activation == 1:
+        return math.tanh(v)
+    return v if v > 0 else v * 0.01
+
+
+@reassociating_kernel
+def _normalise_rows(y: _Array, scale: _Array, shift: _Array, hat: _Array, inverse: _Array, activation: int) -> None:
+    rows, width = y.shape
+    for i in range(rows):
+        total = y[i, 0] * 0
+        for j in range(width):
+            total += y[i, j]
+        mean = total / y.dtype.type(width)
+        spread = y[i, 0] * 0
+        for j in range(width):
+            spread += (y[i, j] - mean) * (y[i, j] - mean)
+        inv = y.dtype.type(1.0 / math.sqrt(spread / width + _LAYER_NORM_EPS))
+        inverse[i] = inv
+        for j in range(width):
+            h = (y[i, j] - mean) * inv
+            hat[i, j] = h
+            y[i, j] = h * scale[j] + shift[j]
+        if activation == 0:
+            for j in range(width):
+                y[i, j] = max(y[i, j], y.dtype.type(0))
+        else:
+            for j in range(width):
+                y[i, j] = _activate(y[i, j], activation)
+
+
+@reassociating_kernel
+def _forward(
+    params: _Array,
+    plan: _Array,
+    starts: _Array,
+    copy: int,
+    activation: int,
+    x: _Array,
+    acts: _Array,
+    hats: _Array,
+    inverse: _Array,
+) -> _Array:
+    rows = x.shape[0]
+    num_layers = plan.shape[0]
+    h = x
+    for layer in range(num_layers):
+        fan_in, fan_out = plan[layer, 0], plan[layer, 1]
+        at = plan[layer, 2] + copy * fan_in * fan_out
+        weight = params[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
+        at = plan[layer, 3] + copy * fan_out
+        bias = params[at : at + fan_out]
+        block = rows * starts[layer]
+        y = acts[block : block + rows * fan_out].reshape(rows, fan_out)
+        np.dot(h, weight, y)
+        last = layer == num_layers - 1
+        if last or activation != 0 or plan[layer, 4] >= 0:
+            for i in range(rows):
+                for j in range(fan_out):
+                    y[i, j] += bias[j]
+        else:
+            for i in range(rows):
+                for j in range(fan_out):
+                    y[i, j] = max(y[i, j] + bias[j], params.dtype.type(0))
+        if not last:
+            if plan[layer, 4] >= 0:
+                at = plan[layer, 4] + copy * fan_out
+                scale = params[at : at + fan_out]
+                at = plan[layer, 5] + copy * fan_out
+                shift = params[at : at + fan_out]
+                hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
+                _normalise_rows(y, scale, shift, hat, inverse[rows * layer : rows * (layer + 1)], activation)
+            elif activation != 0:
+                for i in range(rows):
+                    for j in range(fan_out):
+                        y[i, j] = _activate(y[i, j], activation)
+        h = y
+    return h
+
+
+@reassociating_kernel
+def _through_activation(d: _Array, y: _Array, activation: int) -> None:
+    """Multiply by the activation's derivative, which all three give from the output alone."""
+    rows, width = d.shape
+    for i in range(rows):
+        if activation == 0:
+            for j in range(width):
+                d[i, j] = d[i, j] if y[i, j] > 0 else d.dtype.type(0)
+        elif activation == 1:
+            for j in range(width):
+                d[i, j] *= d.dtype.type(1) - y[i, j] * y[i, j]
+        else:
+            for j in range(width):
+                d[i, j] = d[i, j] if y[i, j] > 0 else d[i, j] * d.dtype.type(0.01)
+
+
+@reassociating_kernel
+def _through_norm(
+    d: _Array, hat: _Array, inverse: _Array, scale: _Array, grad_scale: _Array, grad_shift: _Array
+) -> None:
+    """Ba et al. (2016): dy = (g − mean(g) − ŷ·mean(g·ŷ))/σ with g = d·scale, row by row."""
+    rows, width = d.shape
+    for i in range(rows):
+        mean = d[i, 0] * 0
+        along = d[i, 0] * 0
+        for j in range(width):
+            grad_shift[j] += d[i, j]
+            grad_scale[j] += d[i, j] * hat[i, j]
+        for j in range(width):
+            g = d[i, j] * scale[j]
+            d[i, j] = g
+            mean += g
+            along += g * hat[i, j]
+        mean /= d.dtype.type(width)
+        along /= d.dtype.type(width)
+        inv = inverse[i]
+        for j in range(width):
+            d[i, j] = (d[i, j] - mean - hat[i, j] * along) * inv
+
+
+@reassociating_kernel
+def _backward(
+    params: _Array,
+    grads: _Array,
+    plan: _Array,
+    starts: _Array,
+    copy: int,
+    activation: int,
+    x: _Array,
+    acts: _Array,
+    hats: _Array,
+    inverse: _Array,
+    deltas: _Array,
+) -> None:
+    """Gradient of Σ outputs·(their block of ``deltas``), written over ``grads`` of this copy."""
+    rows = x.shape[0]
+    num_layers = plan.shape[0]
+    for layer in range(num_layers - 1, -1, -1):
+        fan_in, fan_out = plan[layer, 0], plan[layer, 1]
+        block = rows * starts[layer]
+        d = deltas[block : block + rows * fan_out].reshape(rows, fan_out)
+        if layer < num_layers - 1:
+            _through_activation(d, acts[block : block + rows * fan_out].reshape(rows, fan_out), activation)
+            if plan[layer, 4] >= 0:
+                at = plan[layer, 4] + copy * fan_out
+                scale = params[at : at + fan_out]
+                grad_scale = grads[at : at + fan_out]
+                at = plan[layer, 5] + copy * fan_out
+                hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
+                row_inverse = inverse[rows * layer : rows * (layer + 1)]
+                _through_norm(d, hat, row_inverse, scale, grad_scale, grads[at : at + fan_out])
+        at = plan[layer, 3] + copy * fan_out
+        grad_bias = grads[at : at + fan_out]
+        for i in range(rows):
+            for j in range(fan_out):
+                grad_bias[j] += d[i, j]
+        at = plan[layer, 2] + copy * fan_in * fan_out
+        grad_weight = grads[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
+        h = x
+        if layer > 0:
+            below = rows * starts[layer - 1]
+            h = acts[below : below + rows * fan_in].reshape(rows, fan_in)
+        np.dot(h.T, d, grad_weight)
+        if layer > 0:
+            weight = params[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
+            below = rows * starts[layer - 1]
+            np.dot(d, weight.T, deltas[below : below + rows * fan_in].reshape(rows, fan_in))
+
+
+@reassociating_kernel
+def _pair(pairs: _Array, row: int, x: _Array, i: int, action: int) -> None:
+    """Write state i with a one-hot action. (Loops, here and below: slice assignment doubles the compile time.)"""
+    width = x.shape[1]
+    for j in range(width):
+        pairs[row, j] = x[i, j]
+    for j in range(width, pairs.shape[1]):
+        pairs[row, j] = 0
+    pairs[row, width + action] = 1
+
+
+@reassociating_kernel
+def all_values(
+    params: _Array,
+    plan: _Array,
+    starts: _Array,
+    layout: int,
+    num_actions: int,
+    activation: int,
+    x: _Array,
+    acts: _Array,
+    hats: _Array,
+    inverse: _Array,
+    pairs: _Array,
+    out: _Array,
+) -> None:
+    """Action values of every action: rows ``x [B, d]`` into ``out [B, A]``."""
+    rows, width = x.shape
+    if layout == ACTION_OUTPUT:
+        q = _forward(params, plan, starts, 0, activation, x, acts, hats, inverse)
+        for i in range(rows):
+            for c in range(num_actions):
+                out[i, c] = q[i, c]
+    elif layout == SEPARATE:
+        for c in range(num_actions):
+            q = _forward(params, plan, starts, c, activation, x, acts, hats, inverse)
+            for i in range(rows):
+                out[i, c] = q[i, 0]
+    else:
+        both = pairs[: rows * num_actions * (width + num_actions)].reshape(rows * num_actions, width + num_actions)
+        for i in range(rows):
+            for c in range(num_actions):
+                _pair(both, i * num_actions + c, x, i, c)
+        q = _forward(params, plan, starts, 0, activation, both, acts, hats, inverse)
+        for i in range(rows):
+            for c in range(num_actions):
+                out[i, c] = q[i * num_actions + c, 0]
+
+
+@reassociating_kernel
+def _slope(q: float, target: float, weight: float, loss: int, delta: float, rows: int) -> float:
+    """d(mean weighted loss)/dq, or ``weight`` itself where the gradient of the value is wanted."""
+    if loss == VALUE:
+        return weight
+    error = target - q
+    if loss == HUBER:
+        error = min(max(error, -delta), delta)
+    return -weight * error / rows
+
+
+@reassociating_kernel
+def pull(
+    params: _Array,
+    grads: _Array,
+    plan: _Array,
+    starts: _Array,
+    layout: int,
+    num_actions: int,
+    activation: int,
+    x: _Array,
+    a: _Array,
+    target: _Array,
+    weight: _Array,
+    loss: int,
+    delta: float,
+    acts: _Array,
+    hats: _Array,
+    inverse: _Array,
+    deltas: _Array,
+    pairs: _Array,
+    q_out: _Array,
+) -> None:
+    """Write the loss's gradient over ``grads`` and Q(s, a) ``[B]`` into ``q_out``.
+
+    The loss is the mean over rows of weight·½(target − Q)² or its Huber form; with ``loss=VALUE`` the gradient is that of
+    Σ weight·Q(s, a).
+    """
+    rows, width = x.shape
+    for i in range(grads.size):
+        grads[i] = 0
+    top = starts[plan.shape[0] - 1]
+    if layout == SEPARATE:
+        for c in range(num_actions):
+            count = 0
+            for i in range(rows):
+                if a[i] == c:
+                    for j in range(width):
+                        pairs[count * width + j] = x[i, j]
+                    count += 1
+            if count == 0:
+                continue
+            own = pairs[: count * width].reshape(count, width)
+            q = _forward(params, plan, starts, c, activation, own, acts, hats, inverse)
+            at = 0
+            for i in range(rows):
+                if a[i] == c:
+                    q_out[i] = q[at, 0]
+                    deltas[count * top + at] = _slope(q[at, 0], target[i], weight[i], loss, delta, rows)
+                    at += 1
+            _backward(params, grads, plan, starts, c, activation, own, acts, hats, inverse, deltas)
+        return
+    inputs = x
+    outputs = num_actions
+    if layout == ACTION_INPUT:
+        outputs = 1
+        inputs = pairs[: rows * (width + num_actions)].reshape(rows, width + num_actions)
+        for i in range(rows):
+            _pair(inputs, i, x, i, a[i])
+    q = _forward(params, plan, starts, 0, activation, inputs, acts, hats, inverse)
+    slope = deltas[rows * top : rows * top + rows * outputs].reshape(rows, outputs)
+    for i in range(rows):
+        for j in range(outputs):
+            slope[i, j] = 0
+        c = 0 if layout == ACTION_INPUT else a[i]
+        q_out[i] = q[i, c]
+        slope[i, c] = _slope(q[i, c], target[i], weight[i], loss, delta, rows)
+    _backward(params, grads, plan, starts, 0, activation, inputs, acts, hats, inverse, deltas)
