@@ -1,0 +1,72 @@
+"""A trained agent: a representation, how observations reach it, and what its values mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuralq.acting import choose_greedy
+from neuralq.features import Encoder
+from neuralq.interact import ObservationSpec
+from neuralq.types import QFunction
+
+__all__ = ["Agent"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class Agent:
+    """Acts greedily and tells what it expects.
+
+    Args:
+        q: the representation.
+        encoder: from the environment's observations to arrays.
+        spec: shape and kind of the encoded observations.
+        first_action: smallest action of the environment (0 unless its space starts elsewhere).
+        reward_scale: by which rewards were multiplied for learning; values are given in the environment's units.
+    """
+
+    def __init__(
+        self, q: QFunction, encoder: Encoder, spec: ObservationSpec, first_action: int = 0, reward_scale: float = 1.0
+    ) -> None:
+        self.q = q
+        self.encoder = encoder
+        self.spec = spec
+        self.first_action = first_action
+        self.reward_scale = reward_scale
+
+    def values(self, observation: Any, action_mask: Any = None) -> _Array:
+        """Action values of one observation, in units of the environment's return.
+
+        Args:
+            observation: as the environment gives it, not batched.
+            action_mask: which actions are legal ``[A]``; all of them where it is left out.
+
+        Returns:
+            ``[A]`` float64, −∞ for illegal actions.
+
+        Raises:
+            ValueError: if the observation is not what the environment's space promises.
+        """
+        encoded = np.asarray(self.encoder.encode_single(observation))[None]
+        if self.spec.masked:
+            mask = np.ones(self.spec.num_actions) if action_mask is None else np.asarray(action_mask)
+            flat = np.concatenate([encoded.reshape(1, -1), mask.reshape(1, -1)], axis=1)
+            encoded = flat.astype(self.spec.dtype)
+        device = next(iter(self.q.parameters())).device  # type: ignore[attr-defined]
+        with torch.no_grad():
+            q = self.q.all(torch.from_numpy(encoded).to(device))[0]
+        values = q.cpu().numpy().astype(np.float64) / self.reward_scale
+        if action_mask is not None and not self.spec.masked:
+            values = np.where(np.asarray(action_mask) != 0, values, -np.inf)
+        return np.asarray(values)
+
+    def predict(self, observation: Any, action_mask: Any = None) -> int:
+        """The greedy action for one observation, ready for ``env.step``.
+
+        Arguments and errors as for `values`.
+        """
+        action, _ = choose_greedy(torch.from_numpy(self.values(observation, action_mask)[None]))
+        return int(action[0]) + self.first_action

@@ -1,0 +1,158 @@
+"""TD(λ) in the forward view: λ-returns over a rollout of parallel environments, fitted for a few epochs, then forgotten.
+
+The method is PQN (Gallici et al., 2024): Peng's Q(λ) with neither replay nor, by default, a target network. Watkins' returns
+cut λ at exploring actions. Values are computed once per rollout, with the parameters that collected it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq import rules
+from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
+from neuralq.learners.update import Descent, Update
+from neuralq.optim import Optimiser
+from neuralq.q.engine import Engine
+from neuralq.types import Transition
+
+__all__ = ["RolloutLearner", "RolloutSettings"]
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """How a `RolloutLearner` learns. Defaults: PQN (Gallici et al., 2024) scaled down to small control problems.
+
+    Args:
+        lambda_: λ in [0, 1]; 0 is one-step Q-learning, 1 the observed return.
+        returns: "peng" (never cut) or "watkins" (λ = 0 where the next action explored).
+        num_envs: parallel environments N.
+        num_steps: steps of each environment per rollout T.
+        num_epochs: passes over the rollout.
+        num_minibatches: parts each pass is split into.
+        learning_rate: of the optimiser.
+        optimiser: "radam", "adam" or "sgd".
+        max_grad_norm: bound on the gradient's norm; None for none.
+        target_period_updates: rollouts between copies into a target network; None for no target network.
+        anneal: whether the learning rate falls linearly to 0 over the run's steps.
+    """
+
+    lambda_: float = 0.65
+    returns: str = "peng"
+    num_envs: int = 32
+    num_steps: int = 32
+    num_epochs: int = 4
+    num_minibatches: int = 4
+    learning_rate: float = 1e-3
+    optimiser: str = "radam"
+    max_grad_norm: float | None = 10.0
+    target_period_updates: int | None = None
+    anneal: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range and minibatches that would be empty."""
+        check_fraction("lambda_", self.lambda_, "for Monte Carlo use lambda_=1")
+        check_choice("returns", self.returns, ("peng", "watkins"))
+        for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
+            check_whole(name, getattr(self, name))
+        check_positive("learning_rate", self.learning_rate)
+        Optimiser(self.optimiser)
+        if self.target_period_updates is not None:
+            check_whole("target_period_updates", self.target_period_updates)
+        if self.num_minibatches > self.num_envs * self.num_steps:
+            raise ValueError(
+                f"num_minibatches={self.num_minibatches} exceeds the {self.num_envs * self.num_steps} samples of a rollout"
+            )
+
+
+class RolloutLearner:
+    """Q(λ) on rollouts ``[T, N]``.
+
+    Args:
+        engine: values and gradients of the representation.
+        settings: how to learn.
+        rng: draws the minibatches.
+        reward_scale: rewards are multiplied by it, so values are too.
+        total_updates: rollouts over which the learning rate falls to 0; None for a constant one.
+
+    Example:
+        >>> from neuralq.q import TableQ
+        >>> from neuralq.q.engine import Loss, TorchEngine
+        >>> settings = RolloutSettings(num_envs=1, num_steps=1, num_epochs=1, num_minibatches=1,
+        ...                            optimiser="sgd", learning_rate=1.0)
+        >>> learner = RolloutLearner(TorchEngine(TableQ(2, 1), Loss()), settings, np.random.default_rng(0))
+        >>> one = torch.ones(1, 1)
+        >>> step = Transition(torch.tensor([[0]]), torch.tensor([[0]]), one, 5 * one, 0 * one, torch.tensor([[1]]), one > 0)
+        >>> learner.update(step).errors.item(), learner.engine.all(torch.tensor(0)).item()
+        (5.0, 5.0)
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        settings: RolloutSettings,
+        rng: np.random.Generator,
+        reward_scale: float = 1.0,
+        total_updates: int | None = None,
+    ) -> None:
+        self.engine = engine
+        self.settings = settings
+        self.rng = rng
+        self.reward_scale = reward_scale
+        self.num_updates = 0
+        self.total_updates = total_updates
+        self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        if settings.target_period_updates is not None:
+            engine.sync_target()
+
+    def targets(self, transition: Transition) -> Tensor:
+        """λ-returns ``[T, N]`` under the present (or the target) values."""
+        q_t = self.engine.all(transition.s_t, target=self.settings.target_period_updates is not None)
+        v_t = q_t.amax(-1)
+        lambda_: Tensor | float = self.settings.lambda_
+        if self.settings.returns == "watkins":
+            greedy = rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
+            lambda_ = rules.watkins_lambda(self.settings.lambda_, greedy, v_t.dtype)
+        r_t = transition.r_t.to(v_t.dtype) * self.reward_scale
+        return rules.lambda_returns(r_t, transition.discount_t.to(v_t.dtype), v_t, lambda_, transition.last_t)
+
+    def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
+        """Fit one rollout ``[T, N]``; rows of weight 0 (an autoreset's step that was never taken) are left out."""
+        targets = self.targets(transition).reshape(-1)
+        s = transition.s_tm1.flatten(0, 1)
+        a = transition.a_tm1.reshape(-1)
+        rows = None if weight is None else weight.reshape(-1).nonzero()[:, 0].cpu().numpy()
+        num_rows = len(targets) if rows is None else len(rows)
+        errors = picked = targets
+        annealed = 1.0 if self.total_updates is None else max(0.0, 1.0 - self.num_updates / self.total_updates)
+        for _ in range(self.settings.num_epochs):
+            order = self.rng.permutation(num_rows)
+            order = order if rows is None else rows[order]
+            for part in np.array_split(order, self.settings.num_minibatches):
+                if len(part) == 0:
+                    continue
+                index = torch.from_numpy(part).to(targets.device)
+                picked = targets[index]
+                errors = self._descent.step(s[index], a[index], picked, None, annealed)
+        self.num_updates += 1
+        period = self.settings.target_period_updates
+        if period is not None and self.num_updates % period == 0:
+            self.engine.sync_target()
+        return Update(errors, picked)
+
+    def begin_streams(self) -> None:
+        """Nothing connects one sample to the next."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, optimiser, target copy and counters."""
+        return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        self.num_updates = int(state["num_updates"])
+        self._descent.load_state_dict(state["descent"])

@@ -1,0 +1,205 @@
+"""From a configuration to the parts of a run: environments, representation, learner, feed and behaviour."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import nn
+
+from neuralq.acting import choose_epsilon_greedy, epsilon_greedy_policy
+from neuralq.features import OneHot, Pixels
+from neuralq.feed import Feed, OnlineFeed, ReplayFeed, RolloutFeed
+from neuralq.interact import Interaction, ObservationSpec, make_vector_env
+from neuralq.learners import (
+    Learner,
+    OnlineLearner,
+    OnlineSettings,
+    ReplayLearner,
+    ReplaySettings,
+    RolloutLearner,
+    RolloutSettings,
+)
+from neuralq.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
+from neuralq.q.engine import Engine, Loss, make_engine
+from neuralq.recipes.config import RunConfig
+from neuralq.replay import Prioritised, ReplayBuffer
+from neuralq.rules import Linear
+from neuralq.snapshot import is_resumable
+from neuralq.training import Plan, Session, seed_for
+from neuralq.types import QFunction, Transition
+
+__all__ = ["build_q", "build_session", "make_envs", "plan_of"]
+
+_NETWORKS = {"action-input": ActionInputQ, "separate": SeparateQ, "action-output": ActionOutputQ}
+
+
+def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    """Parallel environments: the registered vectorised implementation where there is one, else one after another.
+
+    A single environment is stepped directly, which is quicker than a batch of one.
+
+    Raises:
+        ValueError: if the environment is not registered or cannot be made, with what to do about it.
+    """
+    try:
+        spec = gym.spec(config.env)
+        if num_envs > 1 and spec.vector_entry_point is not None:
+            return gym.make_vec(
+                config.env, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs
+            )
+        return make_vector_env(lambda: gym.make(config.env, **config.env_kwargs), num_envs)
+    except gym.error.Error as error:
+        raise ValueError(
+            f"cannot make the environment {config.env!r}: {error}. Name a registered Gymnasium id; an environment of "
+            "your own is found as 'your_module:YourEnv-v0'"
+        ) from error
+    except ModuleNotFoundError as error:
+        raise ValueError(f"cannot make the environment {config.env!r}: {error}") from error
+
+
+def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:
+    """The representation for an environment's observations.
+
+    Args:
+        config: says which layout and body.
+        spec: shape and kind of the observations.
+        rng: draws the initial weights of networks.
+
+    Raises:
+        ValueError: where layout and observations do not go together.
+    """
+    q: QFunction
+    shape, num_categories = spec.inner_shape, spec.num_categories
+    features: nn.Module | None = None
+    if config.layout == "table":
+        if num_categories is None:
+            raise ValueError("a table needs finitely many states; choose another layout")
+        q = TableQ(num_categories, spec.num_actions)
+        return MaskedQ(q, shape) if spec.masked else q
+    if num_categories is not None:
+        features, shape = OneHot(num_categories), (num_categories,)
+    elif spec.dtype == np.uint8:
+        features = Pixels()
+    if config.layout == "linear":
+        flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape))) if len(shape) > 1 else features
+        # One-hot features already span the constant; a bias would make the weights redundant.
+        q = LinearQ(int(np.prod(shape)), spec.num_actions, bias=num_categories is None, features=flat)
+    else:
+        body = config.body or (Conv() if len(shape) == 3 else MLP())
+        q = _NETWORKS[config.layout](shape, spec.num_actions, body, features, rng)
+    return MaskedQ(q, spec.inner_shape) if spec.masked else q
+
+
+def build_session(config: RunConfig) -> Session:
+    """Everything that trains, freshly made from the configuration's seed, with compiled kernels warm.
+
+    Raises:
+        ValueError: for environments and combinations that cannot be learned, with the way out.
+    """
+    settings = config.settings
+    num_envs = getattr(settings, "num_envs", 1)
+    envs = make_envs(config, num_envs)
+    as_index = config.layout == "table"
+    stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index)
+    generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
+    q = build_q(config, stream.spec, np.random.default_rng(seed_for(config.seed, 3)))
+    if isinstance(q, nn.Module):
+        q.to(config.device)
+    loss = Loss(settings.loss) if isinstance(settings, ReplaySettings) else Loss("squared")
+    engine = make_engine(q, loss, config.engine)
+    learner = _learner(config, engine, generators["samples"])
+    feed = _feed(config, stream.spec, num_envs, generators["samples"])
+    epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
+    policy = epsilon_greedy_policy(engine.all, lambda: epsilon.value(stream.num_steps), generators["policy"])
+    evaluation_envs = make_envs(config, config.evaluation_episodes)
+    evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index)
+    probe = is_resumable(
+        lambda: make_envs(config, num_envs), seed_for(config.seed, 5), np.random.default_rng(seed_for(config.seed, 6))
+    )
+    _warm(engine, stream, settings)
+    return Session(stream, policy, feed, learner, generators, evaluation, probe)
+
+
+def _learner(config: RunConfig, engine: Engine, rng: np.random.Generator) -> Learner:
+    settings = config.settings
+    if isinstance(settings, RolloutSettings):
+        rows = settings.num_envs * settings.num_steps
+        total = -(-config.total_steps // rows) if settings.anneal else None
+        return RolloutLearner(engine, settings, rng, config.reward_scale, total)
+    if isinstance(settings, ReplaySettings):
+        return ReplayLearner(engine, settings, config.reward_scale)
+    return OnlineLearner(engine, settings, 1, config.reward_scale)
+
+
+def _feed(config: RunConfig, spec: ObservationSpec, num_envs: int, rng: np.random.Generator) -> Feed:
+    settings = config.settings
+    if isinstance(settings, RolloutSettings):
+        return RolloutFeed(settings.num_steps, num_envs, spec)
+    if isinstance(settings, OnlineSettings):
+        return OnlineFeed(num_envs, spec)
+    buffer = _buffer(settings, spec, settings.capacity)
+    return ReplayFeed(
+        buffer, rng, settings.batch_size, settings.block_length, settings.learning_starts, settings.train_period,
+        settings.updates_per_period,
+    )  # fmt: skip
+
+
+def _buffer(settings: ReplaySettings, spec: ObservationSpec, capacity: int) -> ReplayBuffer:
+    return ReplayBuffer(
+        capacity, spec.shape, spec.dtype, num_lanes=settings.num_envs, num_steps=settings.num_steps,
+        prioritised=Prioritised() if settings.prioritised else None,
+    )  # fmt: skip
+
+
+def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
+    """Compile, or load from the cache, every kernel the run will call, so that its clock measures training."""
+    s = torch.from_numpy(stream.state_dict()["s"])
+    q = engine.all(s)
+    a, _ = choose_epsilon_greedy(q, 0.5, np.full(len(s), 0.5))
+    if isinstance(settings, OnlineSettings):
+        return
+    engine.loss_gradient(s, a.to(q.device), torch.zeros(len(s), dtype=q.dtype, device=q.device))
+    engine.flat.grad.zero_()
+    throwaway = torch.ones(2, dtype=q.dtype, device=q.device)
+    assert isinstance(settings, RolloutSettings | ReplaySettings)
+    FlatOptimiser(Optimiser(settings.optimiser), throwaway).step(throwaway.clone(), 0.0)
+    clip_norm_(throwaway, 0.5)
+    if isinstance(settings, ReplaySettings):
+        _warm_buffer(_buffer(settings, stream.spec, 8 * settings.num_envs), stream, settings)
+
+
+def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: ReplaySettings) -> None:
+    s = stream.state_dict()["s"]
+    rng = np.random.default_rng(0)
+    lanes = range(settings.num_envs)
+    one = np.ones(len(s), np.float32)
+    fields: tuple[Any, ...] = (s, np.zeros(len(s), np.int64), one, one, one, s, np.zeros(len(s), bool))
+    for _ in range(4):
+        if len(s) == 1:
+            buffer.add_step(0, s[0], 0, 1.0, 1.0, 1.0, s[0], False)
+        else:
+            buffer.add(Transition(*(torch.from_numpy(x) for x in fields)), np.array(lanes, np.int64))
+    if settings.block_length > 1:
+        buffer.sample_blocks(1, 2, rng)
+    else:
+        batch = buffer.sample(2, rng)
+        if settings.prioritised:
+            buffer.update_priorities(batch.indices, np.ones(2))
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """When this run evaluates, saves and stops."""
+    return Plan(
+        total_steps=config.total_steps,
+        stop_at_return=config.stop_at_return,
+        evaluate_every=config.evaluate_every,
+        evaluation_episodes=config.evaluation_episodes,
+        checkpoint_every=config.checkpoint_every,
+        log_every=config.log_every,
+        seed=config.seed,
+    )

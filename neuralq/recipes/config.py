@@ -1,0 +1,154 @@
+"""The configuration of a run: one frozen dataclass that refuses contradictions and is stored beside the results."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
+from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
+from neuralq.q import MLP, Conv
+
+__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "config_from_dict", "config_to_dict"]
+
+LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
+LEARNERS: dict[str, type[RolloutSettings] | type[ReplaySettings] | type[OnlineSettings]] = {
+    "rollout": RolloutSettings,
+    "replay": ReplaySettings,
+    "online": OnlineSettings,
+}
+NETWORKS = ("action-input", "separate", "action-output")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run.
+
+    Args:
+        env: Gymnasium id, or "module:id" to import a module that registers it.
+        env_kwargs: passed to `gymnasium.make`.
+        learner: "rollout", "replay" or "online".
+        layout: "table", "linear", "action-input", "separate" or "action-output".
+        seed: from which every generator is derived.
+        total_steps: environment steps, summed over parallel environments.
+        stop_at_return: stop once a greedy evaluation averages at least this.
+        gamma: discount γ.
+        reward_scale: rewards are multiplied by it for learning; reported returns and values are not.
+        epsilon_start: exploration at the first step.
+        epsilon_end: exploration after ``epsilon_decay_steps``, reached linearly.
+        epsilon_decay_steps: environment steps.
+        body: network body, MLP or Conv; networks only. None picks MLP, or Conv for images.
+        rollout: settings of the rollout learner; only with ``learner="rollout"``.
+        replay: settings of the replay learner; only with ``learner="replay"``.
+        online: settings of the online learner; only with ``learner="online"``.
+        evaluate_every: environment steps between greedy evaluations.
+        evaluation_episodes: episodes of each evaluation.
+        checkpoint_every: environment steps between checkpoints.
+        log_every: environment steps between rows of training metrics.
+        engine: "auto", "torch" or "compiled".
+        device: "cpu", "cuda", "cuda:1", ….
+        threads: CPU threads for linear algebra; small networks are fastest on one.
+    """
+
+    env: str = "CartPole-v1"
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    learner: str = "rollout"
+    layout: str = "action-output"
+    seed: int = 0
+    total_steps: int = 100_000
+    stop_at_return: float | None = None
+    gamma: float = 0.99
+    reward_scale: float = 1.0
+    epsilon_start: float = 1.0
+    epsilon_end: float = 0.05
+    epsilon_decay_steps: int = 20_000
+    body: MLP | Conv | None = None
+    rollout: RolloutSettings | None = None
+    replay: ReplaySettings | None = None
+    online: OnlineSettings | None = None
+    evaluate_every: int = 4096
+    evaluation_episodes: int = 20
+    checkpoint_every: int = 50_000
+    log_every: int = 1024
+    engine: str = "auto"
+    device: str = "cpu"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range and settings that would be ignored; fill in the learner's defaults."""
+        check_choice("learner", self.learner, LEARNERS)
+        check_choice("layout", self.layout, LAYOUTS)
+        check_choice("engine", self.engine, ("auto", "torch", "compiled"))
+        check_discount("gamma", self.gamma)
+        check_positive("reward_scale", self.reward_scale)
+        check_fraction("epsilon_start", self.epsilon_start)
+        check_fraction("epsilon_end", self.epsilon_end)
+        check_whole("seed", self.seed, 0)
+        for name in ("total_steps", "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every", "threads"):
+            check_whole(name, getattr(self, name))
+        check_whole("epsilon_decay_steps", self.epsilon_decay_steps)
+        for name, settings in LEARNERS.items():
+            given = getattr(self, name)
+            if name == self.learner and given is None:
+                object.__setattr__(self, name, settings())
+            elif name != self.learner and given is not None:
+                raise ValueError(
+                    f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
+                    f"use learner={name!r} or leave them out"
+                )
+        if self.body is not None and self.layout not in NETWORKS:
+            raise ValueError(f"a {self.layout} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
+        if self.engine == "compiled" and (self.layout not in NETWORKS or isinstance(self.body, Conv)):
+            raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+
+    @property
+    def settings(self) -> RolloutSettings | ReplaySettings | OnlineSettings:
+        """The settings of the learner that runs."""
+        chosen: RolloutSettings | ReplaySettings | OnlineSettings = getattr(self, self.learner)
+        return chosen
+
+
+def config_to_dict(config: RunConfig) -> dict[str, Any]:
+    """Plain values, for JSON; the body is named by its class.
+
+    Example:
+        >>> config_to_dict(RunConfig(seed=3))["rollout"]["returns"]
+        'peng'
+    """
+    plain = dataclasses.asdict(config)
+    if config.body is not None:
+        plain["body"] = {"class": type(config.body).__name__, **plain["body"]}
+    return {name: value for name, value in plain.items() if name not in LEARNERS or name == config.learner}
+
+
+def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
+    """The configuration that `config_to_dict` wrote.
+
+    Raises:
+        ValueError: for keys that this version does not know.
+
+    Example:
+        >>> config_from_dict(config_to_dict(RunConfig(seed=3))) == RunConfig(seed=3)
+        True
+    """
+    values = dict(plain)
+    _refuse_unknown("the configuration", values, RunConfig)
+    for name, settings in LEARNERS.items():
+        if values.get(name) is not None:
+            _refuse_unknown(name, values[name], settings)
+            values[name] = settings(**values[name])
+    if values.get("body") is not None:
+        body = dict(values["body"])
+        kind = {"MLP": MLP, "Conv": Conv}[body.pop("class")]
+        _refuse_unknown("body", body, kind)
+        values["body"] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in body.items()})
+    return RunConfig(**values)
+
+
+def _refuse_unknown(where: str, given: Mapping[str, Any], known: type) -> None:
+    names = {f.name for f in dataclasses.fields(known)}
+    unknown = sorted(set(given) - names)
+    if unknown:
+        raise ValueError(f"{where} has unknown keys {', '.join(unknown)}; known are {', '.join(sorted(names))}")

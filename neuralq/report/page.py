@@ -1,0 +1,183 @@
+"""A small HTML5 page: escaped text, tables, figures, one style sheet inside; it loads nothing and runs nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table"]
+
+_STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #fff; color: #1b1b1b; font: 1rem/1.55 system-ui, sans-serif; }
+main, header, footer { max-width: 46rem; margin: 0 auto; padding: 0 1rem; }
+header { padding-top: 1.5rem; }
+h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 .25rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.2rem; margin: 2.2rem 0 .5rem; }
+p { margin: .6rem 0; max-width: 40rem; overflow-wrap: anywhere; }
+.lead { color: #444; }
+.warning { border-left: .3rem solid #d55e00; padding: .4rem .8rem; background: #fdf3ec; }
+figure { margin: 1rem 0; }
+figcaption { color: #444; font-size: .92rem; }
+svg.figure { display: block; width: 100%; height: auto; }
+.scroll { overflow-x: auto; margin: .3rem 0 .8rem; }
+table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
+.caption { color: #444; font-size: .92rem; margin-bottom: 0; }
+th, td { text-align: left; vertical-align: top; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid #e3e3e3; }
+th { font-weight: 600; }
+.facts td { overflow-wrap: anywhere; }
+.facts th { min-width: 8rem; }
+summary { cursor: pointer; font-weight: 600; margin: 1.4rem 0 .4rem; }
+footer { color: #555; font-size: .85rem; padding-top: 1.5rem; padding-bottom: 2rem; }
+@media print { details > * { display: block; } .scroll { overflow: visible; } }
+"""
+
+
+@dataclass(slots=True)
+class Page:
+    """A page put together from top to bottom; every text is escaped, only figures and tables go in as they are.
+
+    Example:
+        >>> page = Page("Run <1>")
+        >>> page.paragraph("a & b")
+        >>> "Run &lt;1&gt;" in page.html() and "a &amp; b" in page.html()
+        True
+    """
+
+    title: str
+    lead: str = ""
+    _body: list[str] = field(default_factory=list)
+
+    def heading(self, text: str) -> None:
+        """A section's heading."""
+        self._body.append(f"<h2>{escape(text)}</h2>")
+
+    def paragraph(self, text: str, *, warning: bool = False) -> None:
+        """A paragraph of plain text, set apart when it is a warning."""
+        self._body.append(f'<p class="warning" role="note">{escape(text)}</p>' if warning else f"<p>{escape(text)}</p>")
+
+    def figure(self, svg: str, caption: str) -> None:
+        """An SVG element with a caption."""
+        self._body.append(f"<figure>\n{svg}\n<figcaption>{escape(caption)}</figcaption>\n</figure>")
+
+    def table(self, table: str) -> None:
+        """A table made by `html_table` or `facts_table`."""
+        self._body.append(table)
+
+    def folded(self, summary: str, table: str) -> None:
+        """A table that opens at a click (no script needed)."""
+        self._body.append(f"<details>\n<summary>{escape(summary)}</summary>\n{table}\n</details>")
+
+    def html(self) -> str:
+        """The whole document."""
+        lead = f'\n<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
+        body = "\n".join(self._body)
+        return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(self.title)}</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<header>
+<h1>{escape(self.title)}</h1>{lead}
+</header>
+<main>
+{body}
+</main>
+<footer>Written by neuralq. This page is one file: it loads nothing and runs nothing.</footer>
+</body>
+</html>
+"""
+
+    def write(self, path: Path) -> Path:
+        """Writes the document in one move: a reader sees the old page or the new one, never half of one."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.partial")
+        partial.write_text(self.html(), encoding="utf-8", errors="replace", newline="\n")
+        os.replace(partial, path)
+        return path
+
+
+def html_table(caption: str, header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A table with column headings; the first cell of each row is its heading; a wide one scrolls by itself."""
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in header)
+    rows = "\n".join(f"<tr>{_cells(row)}</tr>" for row in body)
+    return (
+        f'<p class="caption">{escape(caption)}</p>\n'
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">\n<table>\n'
+        f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>\n</div>"
+    )
+
+
+def facts_table(facts: Mapping[str, Any]) -> str:
+    """A table of names and values; nested mappings get dotted names."""
+    rows = "\n".join(f"<tr>{_cells((key, format_value(value)))}</tr>" for key, value in flatten(facts))
+    return f'<table class="facts">\n<tbody>\n{rows}\n</tbody>\n</table>'
+
+
+def _cells(row: Sequence[str]) -> str:
+    first, *rest = row
+    return f'<th scope="row">{escape(first)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in rest)
+
+
+def flatten(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The entries of nested mappings under dotted names.
+
+    Example:
+        >>> list(flatten({"learner": {"lr": 0.1}, "seed": 3}))
+        [('learner.lr', 0.1), ('seed', 3)]
+    """
+    for key, value in facts.items():
+        if isinstance(value, Mapping) and value:
+            yield from flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def format_number(value: float, digits: int = 4) -> str:
+    """A number for reading: whole ones with thousands separators, others with ``digits`` significant ones.
+
+    Example:
+        >>> format_number(20480.0), format_number(1.0023925, 8), format_number(1e300), format_number(float("nan"))
+        ('20,480', '1.0023925', '1e+300', 'not a number')
+    """
+    if math.isnan(value):
+        return "not a number"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "minus infinite"
+    if value == int(value) and abs(value) < 1e15:
+        return f"{int(value):,}"
+    return f"{value:,.1f}" if 1e4 <= abs(value) < 1e9 else f"{value:.{digits}g}"
+
+
+def format_value(value: Any) -> str:
+    """Any JSON value for reading: yes and no, a dash for null, lists and mappings as JSON.
+
+    Example:
+        >>> format_value(None), format_value(True), format_value([64, 64]), format_value(4096)
+        ('–', 'yes', '[64, 64]', '4,096')
+    """
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{int(value):,}" if abs(int(value)) < 10**15 else str(value)
+    if isinstance(value, float | np.floating):
+        return format_number(float(value), 6)
+    if isinstance(value, str | Path):
+        return str(value)
+    return json.dumps(value, ensure_ascii=False, default=str)

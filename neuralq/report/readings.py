@@ -1,0 +1,131 @@
+"""What a run folder says: its JSON files and the rows of ``metrics.jsonl``, made into series that can be drawn."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "read_json", "read_metrics", "thin"]
+
+Row = Mapping[str, Any]
+_Array = np.ndarray[Any, np.dtype[np.float64]]
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The rows of a ``metrics.jsonl``; a last line cut short by a crash is left out, a missing file has no rows.
+
+    Raises:
+        ValueError: a line that is not the last is no JSON object; names the line.
+    """
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    rows: list[dict[str, Any]] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+        except ValueError:
+            row = None
+        if isinstance(row, dict):
+            rows.append(row)
+        elif number < len(lines):
+            raise ValueError(
+                f"{path} line {number} is no JSON object: {line[:80]!r}; remove the line or restore the file"
+            )
+    return rows
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; a missing file is an empty one.
+
+    Raises:
+        ValueError: the file holds something else; names it.
+    """
+    if not path.exists():
+        return {}
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not valid JSON ({error}); restore it or remove it") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
+    return value
+
+
+def as_float(value: Any) -> float:
+    """The number that ``value`` is; NaN when it is none (null, text, a flag), ±inf beyond float64."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def rows_by_step(rows: Iterable[Row], kind: str) -> list[tuple[float, Row]]:
+    """The rows of one kind in order of environment steps; of two at the same step (after a resume) the later counts."""
+    latest: dict[float, Row] = {}
+    for row in rows:
+        steps = as_float(row.get("env_steps"))
+        if row.get("kind") == kind and math.isfinite(steps):
+            latest[steps] = row
+    return sorted(latest.items(), key=lambda pair: pair[0])
+
+
+def finite_series(rows: Iterable[Row], kind: str, name: str) -> tuple[_Array, _Array]:
+    """Steps and values of one column where the value is a finite number.
+
+    Example:
+        >>> rows = [{"kind": "train", "env_steps": 8, "loss": 0.5}, {"kind": "train", "env_steps": 16, "loss": None}]
+        >>> finite_series(rows, "train", "loss")
+        (array([8.]), array([0.5]))
+    """
+    pairs = [(steps, as_float(row.get(name))) for steps, row in rows_by_step(rows, kind)]
+    kept = np.array([pair for pair in pairs if math.isfinite(pair[1])], np.float64).reshape(-1, 2)
+    return kept[:, 0], kept[:, 1]
+
+
+def first_not_finite(rows: Iterable[Row], kind: str, name: str) -> int | None:
+    """The environment step at which a column first was NaN or infinite (null does not count), or None."""
+    for steps, row in rows_by_step(rows, kind):
+        value = row.get(name)
+        if isinstance(value, int | float) and not isinstance(value, bool) and not math.isfinite(as_float(value)):
+            return int(steps)
+    return None
+
+
+def quartiles(rows: Iterable[Row]) -> tuple[_Array, _Array, _Array]:
+    """Steps, first and third quartile of the returns of each greedy evaluation."""
+    kept = []
+    for steps, row in rows_by_step(rows, "evaluation"):
+        listed = row.get("returns")
+        returns = np.array([as_float(value) for value in listed] if isinstance(listed, list | tuple) else [])
+        if returns.size and np.isfinite(returns).all():
+            kept.append((steps, *np.percentile(np.clip(returns, -1e300, 1e300), [25, 75])))
+    table = np.array(kept, np.float64).reshape(-1, 3)
+    return table[:, 0], table[:, 1], table[:, 2]
+
+
+def thin(x: _Array, y: _Array, most: int = 1200) -> tuple[_Array, _Array]:
+    """At most about ``most`` points that keep each stretch's lowest and highest value, so no spike is lost.
+
+    Example:
+        >>> x = np.arange(10_000.0)
+        >>> spike = np.where(x == 5001, 7.0, 0.0)
+        >>> thin(x, spike)[1].max()
+        np.float64(7.0)
+    """
+    if len(y) <= most:
+        return x, y
+    kept = {0, len(y) - 1}
+    for stretch in np.array_split(np.arange(len(y)), most // 2):
+        kept |= {int(stretch[np.argmin(y[stretch])]), int(stretch[np.argmax(y[stretch])])}
+    order = sorted(kept)
+    return x[order], y[order]

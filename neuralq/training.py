@@ -1,0 +1,343 @@
+"""The training loop: a fold of the stream of experience through feed, learner and hooks.
+
+It knows no algorithm. What a run consists of is in `Session`, what is asked of it in `Plan`, how far it has come in
+`Progress`; a checkpoint holds exactly the first and the last, so a run that stops anywhere goes on bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+
+from neuralq import checkpoint
+from neuralq.evaluation import Evaluation, evaluate_greedy
+from neuralq.feed import Feed
+from neuralq.interact import Interaction, Policy
+from neuralq.learners.update import Learner, Update
+from neuralq.record import RunFolder
+from neuralq.snapshot import Resumability, encode_env, restore_env
+
+__all__ = ["Diverged", "Hook", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
+
+Hook = Callable[[Mapping[str, Any]], None]
+"""Called with every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
+
+
+class Diverged(RuntimeError):
+    """The parameters are no longer finite numbers; the last checkpoint is from before that."""
+
+
+@dataclass
+class Session:
+    """The mutable parts of a run, and nothing else.
+
+    Args:
+        stream: experience from the training environments.
+        policy: the behaviour.
+        feed: between stream and learner.
+        learner: what learns.
+        generators: every generator in use, by name.
+        evaluation_stream: an interaction with an environment made for evaluation.
+        resumability: whether the environments' state can be saved.
+    """
+
+    stream: Interaction
+    policy: Policy
+    feed: Feed
+    learner: Learner
+    generators: dict[str, np.random.Generator]
+    evaluation_stream: Interaction
+    resumability: Resumability
+
+    def evaluate(self, num_episodes: int, seed: int) -> Evaluation:
+        """Greedy evaluation of the present parameters."""
+        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for stream in (self.stream, self.evaluation_stream):
+            with contextlib.suppress(Exception):
+                stream.envs.close()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of a run. Steps are environment steps, summed over parallel environments.
+
+    Args:
+        total_steps: budget.
+        stop_at_return: stop once a greedy evaluation averages at least this; None to use the whole budget.
+        evaluate_every: steps between greedy evaluations.
+        evaluation_episodes: episodes of each.
+        checkpoint_every: steps between checkpoints.
+        log_every: steps between rows of training metrics.
+        seed: from which evaluation seeds are derived.
+    """
+
+    total_steps: int
+    stop_at_return: float | None
+    evaluate_every: int
+    evaluation_episodes: int
+    checkpoint_every: int
+    log_every: int
+    seed: int
+
+
+@dataclass
+class Progress:
+    """How far a run has come.
+
+    Args:
+        env_steps: environment steps.
+        cpu_seconds: CPU time of training, evaluations excluded.
+        wall_seconds: wall time of training and evaluation.
+        greedy_return: mean of the last greedy evaluation, None before the first.
+        best_return: best mean so far.
+        evaluated_at: steps at which that was.
+        reached_at: steps at which ``stop_at_return`` was first met.
+        finished: whether the run has ended by itself.
+    """
+
+    env_steps: int = 0
+    cpu_seconds: float = 0.0
+    wall_seconds: float = 0.0
+    greedy_return: float | None = None
+    best_return: float | None = None
+    evaluated_at: int | None = None
+    reached_at: int | None = None
+    finished: bool = False
+    next_evaluation: int = 0
+    next_checkpoint: int = 0
+    next_log: int = 0
+    recent_returns: list[float] = field(default_factory=list)
+    interrupted_by: str | None = None
+
+
+def seed_for(seed: int, *purpose: int) -> int:
+    """A seed that belongs to one purpose of one run; different runs and purposes do not overlap.
+
+    Example:
+        >>> seed_for(0, 1) != seed_for(0, 2) != seed_for(1, 1)
+        True
+    """
+    return int(np.random.SeedSequence([seed, *purpose]).generate_state(1)[0] >> 1)
+
+
+class _StopRequest:
+    """Remembers SIGTERM and SIGINT, so that the loop can save before it ends."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.name is not None:  # asked twice: at once
+            raise KeyboardInterrupt
+        self.name = signal.Signals(number).name
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen while the block runs; outside the main thread, where Python allows no handlers, do nothing."""
+        try:
+            before = {n: signal.signal(n, self._note) for n in (signal.SIGTERM, signal.SIGINT)}
+        except ValueError:
+            yield
+            return
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> Progress:
+    """Train until the plan is met, the budget is spent or a signal asks to stop; the run folder then holds a checkpoint.
+
+    Args:
+        session: what trains; changed in place.
+        plan: when to evaluate, save and stop.
+        progress: where to begin; changed in place and returned.
+        folder: an open run folder.
+        hooks: called with each row of metrics.
+
+    Raises:
+        EnvironmentFault: if an environment breaks its contract. The last checkpoint stays as it is.
+        Diverged: if the parameters stop being finite. Likewise.
+    """
+    loop = _Loop(session, plan, progress, folder, hooks)
+    request = _StopRequest()
+    with request.listening():
+        loop.run(request)
+    return progress
+
+
+class _Loop:
+    def __init__(
+        self, session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]
+    ) -> None:
+        self.session, self.plan, self.progress, self.folder, self.hooks = session, plan, progress, folder, hooks
+        self.recent = deque(progress.recent_returns, maxlen=100)
+        self.last_update: Update | None = None
+        self._reset_clock()
+        self._log_clock = (progress.env_steps, time.perf_counter())
+        progress.finished = False
+        progress.interrupted_by = None
+        for name, period in (("evaluation", plan.evaluate_every), ("checkpoint", plan.checkpoint_every)):
+            if getattr(progress, f"next_{name}") == 0:
+                setattr(progress, f"next_{name}", period)
+
+    def _reset_clock(self) -> None:
+        self._cpu, self._wall = time.process_time(), time.perf_counter()
+
+    def _stop_clock(self, training: bool = True) -> None:
+        """Book the time since the clock was last read; evaluation counts as wall time only."""
+        if training:
+            self.progress.cpu_seconds += time.process_time() - self._cpu
+        self.progress.wall_seconds += time.perf_counter() - self._wall
+        self._reset_clock()
+
+    def run(self, request: _StopRequest) -> None:
+        session, plan, progress = self.session, self.plan, self.progress
+        while progress.env_steps < plan.total_steps:
+            self._advance()
+            if not session.feed.between_samples:
+                continue
+            if progress.env_steps >= progress.next_log:
+                self._log()
+            if progress.env_steps >= progress.next_evaluation:
+                self._evaluate()
+                if plan.stop_at_return is not None and progress.reached_at is not None:
+                    break
+            if request.name is not None:
+                progress.interrupted_by = request.name
+                self._save()
+                return
+            if progress.env_steps >= progress.next_checkpoint:
+                self._save()
+        if progress.evaluated_at != progress.env_steps:
+            self._evaluate()
+        self._stop_clock()
+        progress.finished = True
+        self._save()
+
+    def _advance(self) -> None:
+        session = self.session
+        step = session.stream.step(session.policy)
+        session.feed.add(step)
+        for episode in step.episodes:
+            self.recent.append(episode.episode_return)
+        for sample in session.feed.draw():
+            update = session.learner.update(sample.transition, sample.weight)
+            session.feed.return_errors(sample, update.errors)
+            self.last_update = update
+        self.progress.env_steps = session.stream.num_steps
+
+    def _record(self, row: dict[str, Any]) -> None:
+        self.folder.append_metrics(row)
+        for hook in self.hooks:
+            hook(row)
+
+    def _log(self) -> None:
+        self._stop_clock()
+        progress = self.progress
+        progress.next_log = progress.env_steps + self.plan.log_every
+        then, now = self._log_clock, (progress.env_steps, time.perf_counter())
+        self._log_clock = now
+        row: dict[str, Any] = {
+            "kind": "train",
+            "env_steps": progress.env_steps,
+            "cpu_seconds": progress.cpu_seconds,
+            "wall_seconds": progress.wall_seconds,
+            "steps_per_second": (now[0] - then[0]) / max(now[1] - then[1], 1e-9),
+            "episode_return": float(np.mean(self.recent)) if self.recent else None,
+            "num_updates": self.session.learner.num_updates,
+        }
+        if self.last_update is not None:
+            row |= self.last_update.metrics()
+        self._record(row)
+
+    def _evaluate(self) -> None:
+        self._stop_clock()
+        session, plan, progress = self.session, self.plan, self.progress
+        progress.next_evaluation = (progress.env_steps // plan.evaluate_every + 1) * plan.evaluate_every
+        progress.evaluated_at = progress.env_steps
+        result = session.evaluate(plan.evaluation_episodes, seed_for(plan.seed, 9, progress.env_steps))
+        progress.greedy_return = result.mean
+        progress.best_return = max(result.mean, -np.inf if progress.best_return is None else progress.best_return)
+        if plan.stop_at_return is not None and progress.reached_at is None and result.mean >= plan.stop_at_return:
+            progress.reached_at = progress.env_steps
+        self._stop_clock(training=False)
+        self._record(
+            {
+                "kind": "evaluation",
+                "env_steps": progress.env_steps,
+                "cpu_seconds": progress.cpu_seconds,
+                "wall_seconds": progress.wall_seconds,
+                "greedy_return": result.mean,
+                "returns": list(result.returns),
+                "num_cut": result.num_cut,
+            }
+        )
+
+    def _save(self) -> None:
+        progress = self.progress
+        progress.recent_returns = list(self.recent)
+        period = self.plan.checkpoint_every
+        progress.next_checkpoint = (progress.env_steps // period + 1) * period
+        parameters = self.session.learner.engine.flat.values
+        if not bool(torch.isfinite(parameters).all()):
+            raise Diverged(
+                f"after {progress.env_steps:,} environment steps the parameters are no longer finite: training "
+                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
+                "or λ nearer 1"
+            )
+        self._stop_clock()
+        checkpoint.save(self.folder.checkpoints_path, progress.env_steps, _state(self.session, progress))
+
+
+def _state(session: Session, progress: Progress) -> dict[str, Any]:
+    """Everything that a continued run needs, as one tree."""
+    exact = session.resumability.exact
+    return {
+        "progress": asdict(progress),
+        "learner": session.learner.state_dict(),
+        "feed": session.feed.state_dict(),
+        "stream": session.stream.state_dict(),
+        "environments": encode_env(session.stream.envs) if exact else None,
+        "generators": {name: rng.bit_generator.state for name, rng in session.generators.items()},
+    }
+
+
+def restore(session: Session, state: Mapping[str, Any], seed: int) -> Progress:
+    """Put a freshly built session where the saved one stood.
+
+    Where the environments' state could not be saved, every environment starts a new episode, with a seed of its own.
+
+    Args:
+        session: built from the same configuration; changed in place.
+        state: what a checkpoint holds.
+        seed: of the run.
+    """
+    session.learner.load_state_dict(state["learner"])
+    session.feed.load_state_dict(state["feed"])
+    for name, rng in session.generators.items():
+        rng.bit_generator.state = state["generators"][name]
+    progress = Progress(**state["progress"])
+    environments: VectorEnv[Any, Any, Any] = session.stream.envs
+    if state["environments"] is not None:
+        restore_env(environments, state["environments"])
+        session.stream.load_state_dict(state["stream"])
+    else:
+        session.stream.restart(seed_for(seed, 8, progress.env_steps))
+        session.stream.num_steps = progress.env_steps
+        session.learner.begin_streams()
+    return progress
