@@ -15,16 +15,18 @@ if TYPE_CHECKING:
     from neuralq import recipes as recipes
     from neuralq import report as report
     from neuralq import rules as rules
-    from neuralq.agent import load as load
     from neuralq.mdp import FiniteMDP as FiniteMDP
     from neuralq.q import ActionInputQ as ActionInputQ
     from neuralq.q import ActionOutputQ as ActionOutputQ
     from neuralq.q import LinearQ as LinearQ
     from neuralq.q import SeparateQ as SeparateQ
     from neuralq.q import TableQ as TableQ
+    from neuralq.recipes import Run as Run
+    from neuralq.recipes import RunConfig as RunConfig
+    from neuralq.recipes import load as load
+    from neuralq.recipes import resume as resume
+    from neuralq.recipes import train as train
     from neuralq.replay import ReplayBuffer as ReplayBuffer
-    from neuralq.training import resume as resume
-    from neuralq.training import train as train
     from neuralq.types import QFunction as QFunction
     from neuralq.types import Transition as Transition
 
@@ -37,6 +39,8 @@ __all__ = [
     "LinearQ",
     "QFunction",
     "ReplayBuffer",
+    "Run",
+    "RunConfig",
     "SeparateQ",
     "TableQ",
     "Transition",
@@ -54,7 +58,7 @@ __all__ = [
 ]
 
 # Where each name lives. A name here must not be the name of a module of this package: importing the module would
-# rebind the name (hence neuralq/training.py, which holds `train`).
+# rebind the name (hence neuralq/training.py and not train.py).
 _HOMES = {
     "ActionInputQ": "neuralq.q",
     "ActionOutputQ": "neuralq.q",
@@ -62,12 +66,14 @@ _HOMES = {
     "LinearQ": "neuralq.q",
     "QFunction": "neuralq.types",
     "ReplayBuffer": "neuralq.replay",
+    "Run": "neuralq.recipes",
+    "RunConfig": "neuralq.recipes",
     "SeparateQ": "neuralq.q",
     "TableQ": "neuralq.q",
     "Transition": "neuralq.types",
-    "load": "neuralq.agent",
-    "resume": "neuralq.training",
-    "train": "neuralq.training",
+    "load": "neuralq.recipes",
+    "resume": "neuralq.recipes",
+    "train": "neuralq.recipes",
 }
 
 

@@ -198,7 +198,7 @@ def test_flipped_bits_anywhere_are_noticed(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for file in sorted(path.iterdir()):
         raw = file.read_bytes()
-        places = range(len(raw)) if file.name == "manifest.json" else rng.integers(len(raw), size=25)
+        places = range(0, len(raw), 3) if file.name == "manifest.json" else rng.integers(len(raw), size=25)
         for position in places:
             flip(file, int(position), int(rng.integers(8)))
             with pytest.raises(CheckpointError):

@@ -109,7 +109,7 @@ class Result:
     prediction_scope: str
     verdict: str
     measured_growth: float
-    steps: np.ndarray[Any, Any]
+    steps: int | np.ndarray[Any, Any]
     rmsve: np.ndarray[Any, Any]
     values: np.ndarray[Any, Any]
     exact_values: np.ndarray[Any, Any]
@@ -280,6 +280,8 @@ def test_the_prediction_starts_at_the_first_error_and_multiplies_every_step() ->
     steps = np.array([3, 4, 6])
     drawn = divergence_module._predicted(result(growth=1.5, steps=steps, rmsve=np.array([2.0, 9.0, 9.0])))
     np.testing.assert_allclose(drawn, [2.0, 3.0, 6.75], rtol=1e-12)
+    counted = divergence_module._predicted(result(growth=1.5, steps=2, rmsve=np.array([2.0, 9.0, 9.0])))
+    np.testing.assert_allclose(counted, [2.0, 3.0, 4.5], rtol=1e-12)  # only their number: before and after each sweep
     far = divergence_module._predicted(result(growth=10.0, steps=np.array([0, 100, 900]), rmsve=np.ones(3)))
     np.testing.assert_allclose(far[:2], [1.0, 1e100])
     assert math.isnan(far[2])

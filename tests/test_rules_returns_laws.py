@@ -10,7 +10,7 @@ import torch
 from beartype import beartype
 from hypothesis import given
 from hypothesis import strategies as st
-from jaxtyping import Bool, Float, Int, jaxtyped
+from jaxtyping import Bool, Float, Int, TypeCheckError, jaxtyped
 from torch import Tensor
 
 from neuralq.rules import is_greedy, lambda_returns, n_step_returns, q_learning, watkins_lambda
@@ -187,16 +187,19 @@ def test_wrong_input_is_refused() -> None:
 
 def test_shapes_as_documented() -> None:
     """[T, *n] in, [T, *n] out, and [*n, A] to [*n], checked by jaxtyping and beartype."""
+    rows, rows_of_actions = Float[Tensor, " T *n"], Float[Tensor, " T *n A"]
+    flags, actions = Bool[Tensor, " T *n"], Int[Tensor, " T *n"]
 
-    @jaxtyped(typechecker=beartype)
-    def returns(
-        r: Float[Tensor, "T *n"], q: Float[Tensor, "T *n A"], a: Int[Tensor, "T *n"], last: Bool[Tensor, "T *n"]
-    ) -> Float[Tensor, "T *n"]:
-        lambda_t: Float[Tensor, "T *n"] = watkins_lambda(0.5, is_greedy(q, a))
+    def returns(r, q, a, last):  # type: ignore[no-untyped-def]
+        lambda_t = watkins_lambda(0.5, is_greedy(q, a))
         return lambda_returns(r, r, q.amax(-1), lambda_t, last) + n_step_returns(r, r, q.amax(-1), 2, last)
 
+    returns.__annotations__ = {"r": rows, "q": rows_of_actions, "a": actions, "last": flags, "return": rows}
+    checked = jaxtyped(typechecker=beartype)(returns)
     for shape in ((4,), (4, 2), (1, 3, 2)):
-        returns(torch.ones(shape), torch.ones(*shape, 3), torch.zeros(shape).long(), torch.zeros(shape).bool())
+        checked(torch.ones(shape), torch.ones(*shape, 3), torch.zeros(shape).long(), torch.zeros(shape).bool())
+    with pytest.raises(TypeCheckError):  # the check is in force
+        checked(torch.ones(4), torch.ones(4, 2, 3), torch.zeros(4).long(), torch.zeros(4).bool())
 
 
 @pytest.mark.gpu

@@ -102,7 +102,7 @@ def equal(a: list[Any], b: list[Any]) -> bool:
     )
 
 
-def through_a_file(tree: dict[str, Any], folder: Path) -> dict[str, Any]:
+def through_a_file(tree: Any, folder: Path) -> Any:
     return checkpoint.load(checkpoint.save(folder, 1, {"env": tree})).state["env"]
 
 
@@ -143,8 +143,7 @@ def test_a_tree_shares_nothing_with_its_environment() -> None:
     fresh = gymnasium.make("CartPole-v1")
     restore_env(fresh, tree)
     play(fresh, 5, np.random.default_rng(0))
-    other = gymnasium.make("CartPole-v1")
-    restore_env(other, tree)
+    restore_env(other := gymnasium.make("CartPole-v1"), tree)
     assert str(encode_env(other)) == str(again) == str(tree)
 
 
@@ -223,10 +222,10 @@ class Zoo(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        self.position, self.corner = START, self.origin  # the class's and the module's own, until replaced
+        self.position, self.corner = START, self.origin  # the module's and the class's own, until replaced
         self.board[:] = 0
         self.walkers = [Walker(self.np_random, Point(0, 0), []) for _ in range(2)]
-        self.mood = None
+        self.mood, self.greeting = None, 100.0  # greeted once, then the attribute is gone
         return self.position + self.corner, {}
 
     def step(self, action: Any) -> Any:
@@ -252,7 +251,14 @@ class Zoo(gymnasium.Env[Any, Any]):
         self.queue.append(self.position)
         self.tensor += torch.rand(4, generator=self.torch_rng, dtype=torch.float64)
         shown = self.position + self.tensor.numpy() + self.mersenne.random() + getattr(self, "late", 0)
-        shown = shown + len(self.seen) + sum(self.queue) + self.slotted.tick() + self.score.total
+        shown = (
+            shown
+            + vars(self).pop("greeting", 0.0)
+            + len(self.seen)
+            + sum(self.queue)
+            + self.slotted.tick()
+            + self.score.total
+        )
         shown = shown + sum(len(w.trail) + w.place.x for w in self.walkers) + (self.mood is Mood.WILD)
         shown = shown + next(iter(self.ordered.values())) + self.table[0, "n"] + self.tally[1] + len(self.frozen_set)
         return shown, self.bonus(noise[0]), noise[0] > 2, False, {}
@@ -300,15 +306,11 @@ class OwnProtocol(gymnasium.Env[Any, Any]):
 
 
 class HalfProtocol(OwnProtocol):
-    """Forgets to save what matters: only the probe can tell."""
-
     def set_state(self, state: dict[str, Any]) -> None:
         self._n = 50
 
 
 class WrongProtocol(OwnProtocol):
-    """The same names with another meaning."""
-
     def get_state(self, which: str) -> dict[str, Any]:  # type: ignore[override]
         raise AssertionError("never to be called without which")
 
@@ -317,12 +319,10 @@ class Generates(OwnProtocol):
     get_state = set_state = None  # type: ignore[assignment]
 
     def __init__(self) -> None:
-        self._n, self.script = 0, (i for i in range(9))
+        self.script = (i for i in range(9))
 
 
 class Global(gymnasium.Env[Any, Any]):
-    """Keeps its state where no attribute leads."""
-
     observation_space, action_space = gymnasium.spaces.Discrete(10**6), gymnasium.spaces.Discrete(2)
     counter = 0
 
@@ -382,20 +382,18 @@ def test_the_probe_leaves_the_callers_environment_and_the_global_generators_alon
     ("env_id", "other"), [("CartPole-v1", "Acrobot-v1"), (NEWEST_TAXI, "FrozenLake-v1"), ("CartPole-v1", NEWEST_TAXI)]
 )
 def test_a_state_of_another_environment_is_refused(env_id: str, other: str) -> None:
-    env = gymnasium.make(env_id)
-    env.reset(seed=0)
+    (env := gymnasium.make(env_id)).reset(seed=0)
     with pytest.raises(NotCopyable):
         restore_env(gymnasium.make(other), encode_env(env))
 
 
 def test_another_construction_is_refused() -> None:
-    env = gymnasium.make("FrozenLake-v1", is_slippery=True)
-    env.reset(seed=0)
+    (env := gymnasium.make("FrozenLake-v1", is_slippery=True)).reset(seed=0)
     tree = encode_env(env)
     with pytest.raises(NotCopyable, match=r"env\.env\.env\.env\.P is not what it was"):
         restore_env(gymnasium.make("FrozenLake-v1", is_slippery=False), tree)
     with pytest.raises(NotCopyable):
         restore_env(cartpoles(AutoresetMode.DISABLED), tree)
-    for foreign in ({}, {"snapshot": 2, "root": {}}, {"snapshot": 1}, {"snapshot": 1, "root": {"kind": "object"}}):
+    for foreign in ({}, {"snapshot": 2}, {"snapshot": 1}, {"snapshot": 1, "root": {"kind": "object"}}):
         with pytest.raises(NotCopyable):
             restore_env(gymnasium.make("CartPole-v1"), foreign)

@@ -40,10 +40,10 @@ def learning_curve_svg(rows: Sequence[Row], target: float | None = None, *, name
         if len(greedy_steps):
             if len(band_steps):
                 axes.fill_between(band_steps, tame(low), tame(high), color=COLOURS[0], alpha=0.18, linewidth=0,
-                                  label="middle half of the greedy episodes")  # fmt: skip
+                                  label="its middle half of episodes")  # fmt: skip
             every = max(1, len(greedy_steps) // 40)
             axes.plot(greedy_steps, tame(greedy_returns), color=COLOURS[0], marker="o", markevery=every,
-                      label="greedy evaluation (mean)")  # fmt: skip
+                      label="greedy policy (mean)")  # fmt: skip
         if target is not None:
             axes.axhline(target, color="#555555", linestyle=":", linewidth=1.4, label=f"target {target:g}")
         if not len(train_steps) and not len(greedy_steps):

@@ -80,8 +80,8 @@ def _add_star(page: Page, results: Sequence[DivergenceResult]) -> None:
         "In a table each state has its own number, and an update moves that number alone. With shared weights an "
         "update of one state moves others too; when it lifts the value that it aims at more than its own, the next aim "
         "is higher still. For the table and for linear features one matrix says whether this happens, and by what "
-        "factor per step, from every starting point. For a network the same matrix is made from its derivatives at the "
-        "starting weights, so the prediction holds there and may lose its hold as the weights move away."
+        "factor per sweep, from every starting point. For a network the same matrix is made from its derivatives at "
+        "the starting weights, so the prediction holds there and may lose its hold as the weights move away."
     )
     page.heading("3. Exact values beside learned ones")
     page.table(values_table(results))

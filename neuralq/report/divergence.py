@@ -29,7 +29,7 @@ class DivergenceResult(Protocol):
 
     @property
     def predicted_growth(self) -> float:
-        """Factor by which one step was said to multiply the error; above 1 it grows."""
+        """Factor by which one sweep was said to multiply the error; above 1 it grows."""
         ...
 
     @property
@@ -44,12 +44,12 @@ class DivergenceResult(Protocol):
 
     @property
     def measured_growth(self) -> float:
-        """Factor per step that was measured."""
+        """Factor per sweep that was measured."""
         ...
 
     @property
-    def steps(self) -> _Array:
-        """Steps (sweeps) at which the error was measured, ``[k]``."""
+    def steps(self) -> int | _Array:
+        """Sweeps at which the error was measured, ``[k]``; or their number k - 1, when it was before and after each."""
         ...
 
     @property
@@ -86,7 +86,7 @@ def divergence_svg(results: Sequence[DivergenceResult], *, name: str = "divergen
         for number, result in enumerate(results):
             colour = COLOURS[number % len(COLOURS)]
             marker = MARKERS[number % len(MARKERS)]
-            steps, errors = np.asarray(result.steps, np.float64), _positive(result.rmsve)
+            steps, errors = _sweeps(result), _positive(result.rmsve)
             every = (number * 2, max(1, len(steps) // 8)) if len(steps) > 16 else None
             axes.plot(steps, errors, color=colour, marker=marker, markevery=every)
             shown.append(errors[np.isfinite(errors)])
@@ -104,7 +104,7 @@ def divergence_svg(results: Sequence[DivergenceResult], *, name: str = "divergen
         figure.legend(handles=handles, loc="outside upper left", ncols=3)
 
     description = " ".join(
-        f"{result.representation}: predicted growth {format_number(result.predicted_growth)} per step, "
+        f"{result.representation}: predicted growth {format_number(result.predicted_growth)} per sweep, "
         f"measured {format_number(result.measured_growth)}, {result.verdict}."
         for result in results
     )
@@ -117,8 +117,13 @@ def _positive(errors: _Array) -> _Array:
     return np.where(array > 1e-150, array, np.nan)
 
 
+def _sweeps(result: DivergenceResult) -> _Array:
+    steps = np.asarray(result.steps, np.float64)
+    return steps if steps.ndim else np.arange(len(result.rmsve), dtype=np.float64)
+
+
 def _predicted(result: DivergenceResult) -> _Array:
-    steps, errors = np.asarray(result.steps, np.float64), _positive(result.rmsve)
+    steps, errors = _sweeps(result), _positive(result.rmsve)
     growth = float(result.predicted_growth)
     if not len(errors) or not math.isfinite(errors[0]) or not (math.isfinite(growth) and growth > 0):
         return np.full(len(steps), np.nan)
@@ -141,7 +146,7 @@ def growth_table(results: Sequence[DivergenceResult]) -> str:
         ]
         for result in results
     ]
-    return html_table("Growth of the error per step: below 1 it dies out, above 1 it multiplies", header, body)
+    return html_table("Growth of the error per sweep: below 1 it dies out, above 1 it multiplies", header, body)
 
 
 def values_table(results: Sequence[DivergenceResult]) -> str:

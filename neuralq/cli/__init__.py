@@ -1,0 +1,92 @@
+"""The command line. This module imports nothing heavy: ``neuralq --help`` answers at once, each command loads its own."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+__all__ = ["COMMANDS", "Failure", "main", "print_result"]
+
+COMMANDS = {
+    "train": ("neuralq.cli.runs", "train", "train on a Gymnasium environment by TD(λ)"),
+    "resume": ("neuralq.cli.runs", "resume", "go on with a run that was stopped or killed"),
+    "evaluate": ("neuralq.cli.runs", "evaluate", "play greedy episodes with a trained run"),
+    "report": ("neuralq.cli.runs", "report", "write a run's report.html"),
+    "solve": ("neuralq.cli.exact", "solve", "compute the exact answer of an environment with a model"),
+    "baird": ("neuralq.cli.demo", "baird", "predict divergence on Baird's star, then measure it"),
+    "demo": ("neuralq.cli.demo", "demo", "learn CartPole, predict a divergence, write a page about both"),
+}
+
+EXAMPLES = """examples:
+  neuralq demo
+  neuralq train CartPole-v1 --stop-at-return 475
+  neuralq train neuralq/MitchellGrid-v0 --layout table
+  neuralq resume runs/CartPole-v1-action-output-s0-20260101-120000
+  neuralq solve FrozenLake-v1 --gamma 0.95
+
+`neuralq COMMAND --help` tells a command's options. Every command takes --json."""
+
+
+class Failure(Exception):
+    """A command ends with this message and exit status; nothing else is printed."""
+
+    def __init__(self, message: str, status: int = 1) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def print_result(result: dict[str, Any], as_json: bool, lines: Sequence[str]) -> None:
+    """The result for people, or, with ``--json``, as one JSON object on the last line of standard output."""
+    if as_json:
+        print(json.dumps(result, allow_nan=False), flush=True)
+        return
+    for line in lines:
+        print(line, flush=True)
+
+
+def _top_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="neuralq",
+        description="Learn value functions, beside the exact answer, and know before training whether an update converges.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    from neuralq import __version__
+
+    parser.add_argument("--version", action="version", version=f"neuralq {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, (_, _, summary) in COMMANDS.items():
+        commands.add_parser(name, help=summary, add_help=False)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] not in COMMANDS:
+        _top_parser().parse_args(arguments)
+        return 2  # not reached: argparse has ended the process with help or an error
+    module, function, _ = COMMANDS[arguments[0]]
+    command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
+    try:
+        return command(arguments[1:])
+    except Failure as failure:
+        print(f"neuralq: {failure}", file=sys.stderr)
+        return failure.status
+    except BrokenPipeError:  # whoever read our output has gone
+        sys.stderr.close()
+        return 1
+    except KeyboardInterrupt:
+        print("neuralq: interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, RuntimeError, OSError, ImportError, MemoryError) as error:
+        from neuralq.cli.faults import USER_FAULTS
+
+        if not isinstance(error, USER_FAULTS):
+            raise
+        print(f"neuralq: error: {error}", file=sys.stderr)
+        return 1

@@ -1,0 +1,131 @@
+"""``neuralq train | resume | evaluate | report``."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from neuralq.cli import Failure, print_result
+from neuralq.cli.options import parse_train
+from neuralq.hooks import ProgressBar, TensorBoard
+from neuralq.recipes import Run, evaluate_run
+from neuralq.recipes import resume as resume_run
+from neuralq.recipes import train as train_run
+from neuralq.recipes.config import config_from_dict
+from neuralq.record import default_run_path, read_config
+from neuralq.report import MissingExtra, write_report
+from neuralq.training import Hook
+
+__all__ = ["evaluate", "report", "resume", "train"]
+
+
+def train(argv: list[str]) -> int:
+    """Train as the options say; exit status 0 only if the target was reached, where one was set."""
+    config, extra, preset = parse_train(argv)
+    path = Path(extra.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
+    _say(f"run folder {path}" + (f"; preset for {config.env}" if preset else "") + "; preparing (kernels compile once)")
+    hooks: list[Hook] = []
+    board = TensorBoard(path / "tensorboard") if extra.tensorboard else None
+    if board is not None:
+        hooks.append(board)
+    with ProgressBar(config.total_steps, config.stop_at_return) as bar:
+        run = train_run(config, path, [*hooks, bar])
+    if board is not None:
+        board.close()
+    return _conclude(run, extra.json, config.stop_at_return)
+
+
+def resume(argv: list[str]) -> int:
+    """Go on with a run."""
+    parser = _parser("resume", "Go on with a run from its newest intact checkpoint.", "neuralq resume runs/demo/cartpole")
+    parser.add_argument("run", help="run folder")
+    parser.add_argument("--total-steps", type=int, help="a new budget; lets a finished run go on")
+    options = parser.parse_args(argv)
+    config = config_from_dict(read_config(options.run))
+    with ProgressBar(options.total_steps or config.total_steps, config.stop_at_return) as bar:
+        run = resume_run(options.run, options.total_steps, [bar])
+    return _conclude(run, options.json, config.stop_at_return)
+
+
+def evaluate(argv: list[str]) -> int:
+    """Play greedy episodes with a run's newest checkpoint."""
+    parser = _parser("evaluate", "Play greedy episodes with a trained run.", "neuralq evaluate RUN --episodes 100")
+    parser.add_argument("run", help="run folder")
+    parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    options = parser.parse_args(argv)
+    result = evaluate_run(options.run, options.episodes, options.seed)
+    returns = np.array(result.returns)
+    error = float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None
+    quartiles = np.percentile(returns, [0, 25, 50, 75, 100])
+    plain = {
+        "greedy_return": result.mean,
+        "standard_error": error,
+        "returns": list(result.returns),
+        "lengths": list(result.lengths),
+        "num_cut": result.num_cut,
+        "run_dir": str(options.run),
+    }
+    lines = [
+        f"mean return {result.mean:.2f}" + ("" if error is None else f" ± {error:.2f} (standard error)")
+        + f" over {len(returns)} episodes",
+        "lowest {:.1f}, quartiles {:.1f} {:.1f} {:.1f}, highest {:.1f}".format(*quartiles),
+    ]  # fmt: skip
+    if result.num_cut:
+        lines.append(f"{result.num_cut} episodes were cut off: the environment did not end them")
+    print_result(plain, options.json, lines)
+    return 0
+
+
+def report(argv: list[str]) -> int:
+    """Write a run's report."""
+    parser = _parser("report", "Write a run's report.html (extra plot).", "neuralq report RUN")
+    parser.add_argument("run", help="run folder")
+    options = parser.parse_args(argv)
+    path = write_report(options.run)
+    print_result({"report": str(path)}, options.json, [str(path)])
+    return 0
+
+
+def _parser(name: str, description: str, example: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"neuralq {name}",
+        description=description,
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    return parser
+
+
+def _say(line: str) -> None:
+    print(f"neuralq: {line}", file=sys.stderr, flush=True)
+
+
+def _conclude(run: Run, as_json: bool, target: float | None) -> int:
+    try:
+        report_path = str(write_report(run.run_dir))
+    except MissingExtra as error:
+        report_path = None
+        _say(f"no report: {error}")
+    if run.interrupted_by is not None:
+        _say(f"{run.interrupted_by}: saved at {run.env_steps:,} steps; go on with: neuralq resume {run.run_dir}")
+    _say(run.resumability)
+    summary = {**run.summary(), "report": report_path}
+    score = "not evaluated" if run.greedy_return is None else f"greedy return {run.greedy_return:.1f}"
+    lines = [
+        f"{run.env_steps:,} environment steps, {run.cpu_seconds:.2f} CPU-seconds of training, "
+        f"{run.wall_seconds:.2f} seconds in all; {score}",
+        f"run folder {run.run_dir}" + ("" if report_path is None else f", report {report_path}"),
+    ]
+    print_result(summary, as_json, lines)
+    if run.interrupted_by is not None:
+        return 128 + signal.Signals[run.interrupted_by].value
+    if run.reached is False:
+        raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
+    return 0
