@@ -5,16 +5,17 @@
 
 prints one row for each observation size and operation: microseconds of CPU time of either buffer (the median over
 rounds that alternate between the two, so that a change of the machine's speed meets both) and how many times as many
-operations per CPU-second ours makes. For example:
+operations per CPU-second ours makes. Measured:
 
     observation     operation          ours [us]   SB3 [us]   ratio
-    4 x float32     add, one step           1.56       4.85    3.1x
-    4 x float32     add, rollout            0.43       4.61   10.8x
-    4 x float32     sample 256             18.73      90.72    4.8x
-    84x84x4 uint8   add, one step           2.63       7.77    3.0x
-    84x84x4 uint8   add, rollout            2.03       6.52    3.2x
-    84x84x4 uint8   sample 32             128.46     387.20    3.0x
+    4 x float32     add, one step           1.64       5.15    3.1x
+    4 x float32     add, rollout            0.45       5.27   11.6x
+    4 x float32     sample 256             28.39     125.05    4.4x
+    84x84x4 uint8   add, one step           3.03       7.94    2.6x
+    84x84x4 uint8   add, rollout            2.70       9.04    3.4x
+    84x84x4 uint8   sample 32             124.69     336.54    2.7x
 
+(on a machine of two cores that was busy otherwise; a quiet one is about twice as fast in both columns).
 "add, one step" is the step of one environment, from arrays and Python numbers; "add, rollout" is 64 steps handed over
 at once, as after a rollout (SB3's `extend` is a loop over `add`), counted per step. Samples are tensors on the CPU:
 256 of 4 floats, 32 of 84x84x4 bytes. Both buffers are full, and as large as ``--capacity`` says. When it is so large

@@ -1,8 +1,6 @@
 """The sum tree against NumPy's cumulative sums.
 
-Planted mutants that die here: parent updated by adding a difference (rounding accumulates); `<=` for `<` in the
-descent; no guard against an empty right subtree; leaves offset by one; the path stopping below the root; a stale inner
-node after `load`.
+Planted mutant that dies here: `<=` for `<` in the descent.
 """
 
 from __future__ import annotations
