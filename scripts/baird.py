@@ -25,11 +25,13 @@ At a gamma below the threshold (try --gamma 0.85) the linear features converge a
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from neuralq.lab import BairdResult, predict_baird, run_baird
+from neuralq.lab import predict_baird, run_baird
+from neuralq.report import MissingExtra, divergence_svg
 from neuralq_envs.counterexamples.baird import critical_gamma
 
 
@@ -66,22 +68,11 @@ def main() -> None:
     console.print(measured)
 
     if options.svg is not None:
-        draw(results, options.svg)
+        try:
+            Path(options.svg).write_text(divergence_svg(results), encoding="utf-8")
+        except MissingExtra as error:
+            raise SystemExit(str(error)) from error
         console.print(f"wrote {options.svg}")
-
-
-def draw(results: list[BairdResult], path: str) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise SystemExit("--svg needs matplotlib: pip install 'neuralq[plot]'") from error
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
-    for result in results:
-        axes.semilogy(result.rmsve, label=f"{result.representation} (predicted: {result.verdict})")
-    axes.set(xlabel="expected sweeps", ylabel="root mean squared value error", title="Baird's star")
-    axes.legend()
-    figure.savefig(path, format="svg")
 
 
 if __name__ == "__main__":
