@@ -93,7 +93,7 @@ class TensorBoard:
             raise MissingExtra(
                 'TensorBoard is not installed; install it with: pip install "neuralq[tensorboard]"'
             ) from error
-        self._writer: Any = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+        self._writer: Any = SummaryWriter(str(folder))
 
     def __call__(self, row: Mapping[str, Any]) -> None:
         """Write one row."""

@@ -18,14 +18,16 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
+from torch import Tensor
 
 from neuralq import checkpoint
 from neuralq.evaluation import Evaluation, evaluate_greedy
-from neuralq.feed import Feed
+from neuralq.feed import Feed, Sample
 from neuralq.interact import Interaction, Policy
 from neuralq.learners.update import Learner, Update
 from neuralq.record import RunFolder
 from neuralq.snapshot import Resumability, encode_env, restore_env
+from neuralq.types import Transition
 
 __all__ = ["Diverged", "Hook", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
 
@@ -160,7 +162,7 @@ class _StopRequest:
 
 
 def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> Progress:
-    """Train until the plan is met, the budget is spent or a signal asks to stop; the run folder then holds a checkpoint.
+    """Train until the plan is met, the budget is spent or a signal asks to stop; the folder then holds a checkpoint.
 
     Args:
         session: what trains; changed in place.
@@ -176,8 +178,21 @@ def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hoo
     loop = _Loop(session, plan, progress, folder, hooks)
     request = _StopRequest()
     with request.listening():
-        loop.run(request)
+        try:
+            loop.run(request)
+        except ValueError as error:  # NaN among the values: the policy notices before the next checkpoint would
+            _refuse_divergence(session, progress)
+            raise error
     return progress
+
+
+def _refuse_divergence(session: Session, progress: Progress) -> None:
+    if not bool(torch.isfinite(session.learner.engine.flat.values).all()):
+        raise Diverged(
+            f"after {progress.env_steps:,} environment steps the parameters are no longer finite: training "
+            "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
+            "or λ nearer 1"
+        )
 
 
 class _Loop:
@@ -187,6 +202,7 @@ class _Loop:
         self.session, self.plan, self.progress, self.folder, self.hooks = session, plan, progress, folder, hooks
         self.recent = deque(progress.recent_returns, maxlen=100)
         self.last_update: Update | None = None
+        self.device = session.learner.engine.flat.values.device
         self._reset_clock()
         self._log_clock = (progress.env_steps, time.perf_counter())
         progress.finished = False
@@ -207,7 +223,8 @@ class _Loop:
 
     def run(self, request: _StopRequest) -> None:
         session, plan, progress = self.session, self.plan, self.progress
-        while progress.env_steps < plan.total_steps:
+        # A rollout that was begun is finished: half of one can be neither learned from nor saved.
+        while progress.env_steps < plan.total_steps or not session.feed.between_samples:
             self._advance()
             if not session.feed.between_samples:
                 continue
@@ -236,10 +253,17 @@ class _Loop:
         for episode in step.episodes:
             self.recent.append(episode.episode_return)
         for sample in session.feed.draw():
-            update = session.learner.update(sample.transition, sample.weight)
+            update = session.learner.update(*self._on_device(sample))
             session.feed.return_errors(sample, update.errors)
             self.last_update = update
         self.progress.env_steps = session.stream.num_steps
+
+    def _on_device(self, sample: Sample) -> tuple[Transition, Tensor | None]:
+        """The sample where the learner computes; on the CPU it stays where it is."""
+        if self.device.type == "cpu":
+            return sample.transition, sample.weight
+        weight = None if sample.weight is None else sample.weight.to(self.device)
+        return sample.transition.map(lambda x: x.to(self.device)), weight
 
     def _record(self, row: dict[str, Any]) -> None:
         self.folder.append_metrics(row)
@@ -293,13 +317,7 @@ class _Loop:
         progress.recent_returns = list(self.recent)
         period = self.plan.checkpoint_every
         progress.next_checkpoint = (progress.env_steps // period + 1) * period
-        parameters = self.session.learner.engine.flat.values
-        if not bool(torch.isfinite(parameters).all()):
-            raise Diverged(
-                f"after {progress.env_steps:,} environment steps the parameters are no longer finite: training "
-                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
-                "or λ nearer 1"
-            )
+        _refuse_divergence(self.session, progress)
         self._stop_clock()
         checkpoint.save(self.folder.checkpoints_path, progress.env_steps, _state(self.session, progress))
 

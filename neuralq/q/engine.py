@@ -1,8 +1,8 @@
 """Engines: who computes values and gradients for a learner, and on which code path.
 
-`TorchEngine` runs any `QFunction` through autograd on any device. `MlpEngine` runs the three layouts with an MLP body on a
-CPU through compiled kernels on the same flat parameters; it is chosen automatically where it applies. Learners see no
-difference but speed: both are held to each other by tests.
+`TorchEngine` runs any `QFunction` through autograd on any device. `MlpEngine` runs the three layouts with an MLP body
+on a CPU through compiled kernels on the same flat parameters; it is chosen automatically where it applies. Learners see
+no difference but speed: both are held to each other by tests.
 """
 
 from __future__ import annotations
@@ -55,7 +55,11 @@ class Engine(Protocol):
         ...
 
     def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-        """Errors target − Q(s, a) ``[B]``; leaves the mean loss's gradient in ``flat.grad``."""
+        """Errors target − Q(s, a) ``[*n]``; leaves the mean loss's gradient in ``flat.grad``.
+
+        Raises:
+            ValueError: if ``target`` or ``weight`` is not of the actions' shape, or an action does not exist.
+        """
         ...
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
@@ -89,10 +93,15 @@ class TorchEngine:
     @torch.no_grad()
     def all(self, s: Tensor, target: bool = False) -> Tensor:
         """Action values without gradient, of the target copy if asked for."""
-        return cast(QFunction, self._target if target else self.q).all(s)
+        if target and self._target is None:
+            raise _no_target()
+        # Acting comes with observations from the CPU, wherever the parameters live.
+        return cast(QFunction, self._target if target else self.q).all(s.to(self.flat.values.device))
 
     def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
+        _check_samples(a, target, weight)
+        _check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
         error = target.to(self.flat.values.dtype) - self.q.at(s, a)
         if self.loss.kind == "squared":
@@ -104,6 +113,8 @@ class TorchEngine:
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
+        _check_single(a)
+        _check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
         q = self.q.at(s, a)
         q.backward()  # type: ignore[no-untyped-call]
@@ -121,13 +132,38 @@ class TorchEngine:
         return None if self._target_flat is None else self._target_flat.values
 
 
+def _no_target() -> ValueError:
+    return ValueError("there is no target copy yet; call sync_target() first")
+
+
+def _check_samples(a: Tensor, target: Tensor, weight: Tensor | None) -> None:
+    """One target and weight per action: nothing is broadcast."""
+    if target.shape != a.shape or (weight is not None and weight.shape != a.shape):
+        shapes = f"{tuple(a.shape)}, {tuple(target.shape)} and {None if weight is None else tuple(weight.shape)}"
+        raise ValueError(f"actions, targets and weights must pair up; got shapes {shapes}")
+
+
+def _check_single(a: Tensor) -> None:
+    if a.dim() > 0:
+        raise ValueError(f"a value's gradient is of one action, [], got {tuple(a.shape)}")
+
+
+def _check_actions(a: Tensor, num_actions: int) -> None:
+    """Tables take index −1 for the last; on other devices looking would mean waiting, and gather refuses there."""
+    if a.device.type == "cpu" and a.numel() and not 0 <= int(a.min()) <= int(a.max()) < num_actions:
+        raise ValueError(f"actions must lie in 0..{num_actions - 1}, got {int(a.min())}..{int(a.max())}")
+
+
 def runs_compiled(q: Any) -> bool:
     """Whether `MlpEngine` knows this module: one of the three layouts, an MLP body, on a CPU, float32 or float64."""
-    inner = q.inner if type(q) is MaskedQ else q
+    inner: Any = q.inner if type(q) is MaskedQ else q
     if type(inner) not in (ActionOutputQ, SeparateQ, ActionInputQ) or type(inner.trunk) is not Trunk:
         return False
-    first = next(inner.parameters())
-    return inner.input.stem is None and first.device.type == "cpu" and first.dtype in (torch.float32, torch.float64)
+    # A stem has parameters, and so may a feature map of the user's: only autograd knows their gradient.
+    if any(True for _ in inner.input.parameters()):
+        return False
+    first: Tensor = next(inner.parameters())
+    return first.device.type == "cpu" and first.dtype in (torch.float32, torch.float64)
 
 
 class MlpEngine:
@@ -182,7 +218,10 @@ class MlpEngine:
     def _rows(self, s: Tensor) -> tuple[Any, tuple[int, ...]]:
         if self._plain_input:
             shape = self._net.input.input_shape
-            leading = tuple(s.shape[: s.dim() - len(shape)])
+            cut = s.dim() - len(shape)
+            leading = tuple(s.shape[:cut])
+            if s.shape[cut:] != shape:
+                raise ValueError(f"this network takes observations of shape {shape}, got {tuple(s.shape)}")
             if s.dtype != self._dtype:
                 s = s.to(self._dtype)
             rows = s.numpy().reshape(-1, self._width)
@@ -195,6 +234,8 @@ class MlpEngine:
 
     def all(self, s: Tensor, target: bool = False) -> Tensor:
         """Action values without gradient, of the target copy if asked for."""
+        if target and self._target is None:
+            raise _no_target()
         x, leading = self._rows(s)
         out = np.empty((x.shape[0], self._num_actions), x.dtype)
         values = cast(Tensor, self._target).numpy() if target else self._values
@@ -210,24 +251,26 @@ class MlpEngine:
         actions = a.reshape(-1).numpy()
         if actions.size != x.shape[0]:
             raise ValueError(f"got {x.shape[0]} states and {actions.size} actions; they must pair up")
-        if actions.size and not 0 <= actions.min() <= actions.max() < self._num_actions:
-            raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions.min()}..{actions.max()}")
         q = np.empty(x.shape[0], x.dtype)
-        kernels.pull(
+        wrong = kernels.pull(
             self._values, self._grad, self._plan, self._starts, self._layout, self._num_actions, self._activation,
             x, actions, q if target is None else target, self._ones[: x.shape[0]] if weight is None else weight,
             loss, self._delta, self._acts, self._hats, self._inverse, self._deltas, self._pairs, q,
         )  # fmt: skip
+        if wrong >= 0:
+            raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions[wrong]}")
         return q
 
     def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
-        wanted = target.to(self._dtype).contiguous().numpy()
-        weights = None if weight is None else weight.to(self._dtype).contiguous().numpy()
-        return torch.from_numpy(wanted - self._pull(s, a, wanted, weights, self._loss))
+        _check_samples(a, target, weight)
+        wanted = target.to(self._dtype).reshape(-1).numpy()
+        weights = None if weight is None else weight.to(self._dtype).reshape(-1).numpy()
+        return torch.from_numpy(wanted - self._pull(s, a, wanted, weights, self._loss)).view(a.shape)
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
+        _check_single(a)
         return torch.from_numpy(self._pull(s, a, None, None, kernels.VALUE))[0]
 
     def sync_target(self) -> None:
