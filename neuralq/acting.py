@@ -1,7 +1,7 @@
-"""ε-greedy action selection for a batch, compiled: what `rules.sample(rules.epsilon_greedy(q, ε), u)` gives, in one pass.
+"""ε-greedy action selection for a batch, compiled: `rules.sample(rules.epsilon_greedy(q, ε), u)` in one pass.
 
-Acting happens at every environment step, and as tensor operations it would cost more than a small environment. The rule
-stays the definition; tests/test_acting.py holds this to it.
+Acting happens at every environment step, and as tensor operations it would cost more than a small environment. The
+rule stays the definition; tests/test_acting.py holds this to it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuralq.checks import check_fraction
 from neuralq.jit import kernel
 
 __all__ = ["choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
@@ -27,7 +28,7 @@ def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -
     for i in range(rows):
         best, num_legal = -1, 0
         for j in range(num_actions):
-            if q[i, j] != q[i, j]:
+            if q[i, j] != q[i, j] or q[i, j] == np.inf:
                 return i
             if q[i, j] > -np.inf:
                 num_legal += 1
@@ -42,9 +43,10 @@ def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -
             if q[i, j] > -np.inf:
                 mass = each + (1.0 - epsilon if j == best else 0.0)
                 reached += mass
-                if mass > 0 and left < reached:
+                if mass > 0:  # the last such action stays chosen where rounding leaves the sum below u
                     chosen = j
-                    break
+                    if left < reached:
+                        break
         actions[i] = chosen
         mu[i] = each + (1.0 - epsilon if chosen == best else 0.0)
     return -1
@@ -55,28 +57,36 @@ def choose_epsilon_greedy(q: Tensor, epsilon: float, u: _Array) -> tuple[Tensor,
 
     Args:
         q: action values ``[N, A]``, −∞ for illegal actions.
-        epsilon: in [0, 1]; its mass is spread over the legal actions, the greedy one included. Ties go to the lowest index.
+        epsilon: in [0, 1]; its mass is spread over the legal actions, the greedy one included. Ties go to the
+            lowest index.
         u: uniform numbers in [0, 1), ``[N]`` float64.
 
     Returns:
         Actions ``[N]`` int64 and their probabilities ``[N]`` float32, on the CPU.
 
     Raises:
-        ValueError: if a row holds NaN or no legal action: the learner has diverged, or the environment gave an empty mask.
+        ValueError: if a row holds NaN or +∞ (the learner has diverged) or no legal action (the environment gave an
+            empty mask), if ``epsilon`` is not in [0, 1], or if there is not one number per row.
 
     Example:
         >>> a, mu = choose_epsilon_greedy(torch.tensor([[0.0, 2.0]]), 0.5, np.array([0.9]))
         >>> a.tolist(), mu.tolist()
         ([1], [0.75])
     """
+    check_fraction("epsilon", epsilon)
     values = q.detach().cpu().numpy()
+    if values.ndim != 2 or u.shape != values.shape[:1]:
+        raise ValueError(
+            f"action values must be [N, A] with N uniform numbers, got {tuple(values.shape)} and {u.shape}; "
+            "give a single observation a leading axis of one"
+        )
     actions = np.empty(len(values), np.int64)
     mu = np.empty(len(values), np.float32)
     row = _choose(values, epsilon, u, actions, mu)
     if row >= 0:
         raise ValueError(
-            f"cannot choose an action in environment {row} from the values {values[row].tolist()}: NaN means that "
-            "training diverged (try a smaller step size), all −inf that the action mask allows nothing"
+            f"cannot choose an action in environment {row} from the values {values[row].tolist()}: NaN or inf means "
+            "that training diverged (try a smaller step size), all −inf that the action mask allows nothing"
         )
     return torch.from_numpy(actions), torch.from_numpy(mu)
 

@@ -1,7 +1,7 @@
 """Optimisers that act on one flat vector: plain SGD, Adam and RAdam, each one pass over the parameters.
 
-They equal `torch.optim`'s of the same name step for step (tests/test_optim.py). On a CPU the pass is a compiled kernel, on
-other devices a handful of tensor expressions.
+They equal `torch.optim`'s of the same name step for step (tests/test_optim.py). On a CPU the pass is a compiled kernel,
+on other devices a handful of tensor expressions.
 """
 
 from __future__ import annotations
@@ -41,8 +41,10 @@ class Optimiser:
     def __post_init__(self) -> None:
         """Refuse unknown kinds and constants outside their range."""
         check_choice("optimiser", self.kind, ("sgd", "adam", "radam"))
-        check_fraction("beta1", self.beta1)
-        check_fraction("beta2", self.beta2)
+        for name, beta in (("beta1", self.beta1), ("beta2", self.beta2)):
+            check_fraction(name, beta)
+            if beta == 1:
+                raise ValueError(f"{name} must be below 1, got {beta!r}: a moment that never moves stays at 0")
         check_positive("eps", self.eps)
 
 
@@ -50,23 +52,23 @@ class Optimiser:
 def _moments_kernel(
     p: _Array, g: _Array, m: _Array, v: _Array, b1: float, b2: float, rate: float, root: float, eps: float, plain: bool
 ) -> None:
-    one = p.dtype.type(1)
     c1, c2, step = p.dtype.type(b1), p.dtype.type(b2), p.dtype.type(rate)
+    n1, n2 = p.dtype.type(1.0 - b1), p.dtype.type(1.0 - b2)  # in float32, 1 − 0.999 would be wrong by 1.3e-5 of itself
     scale, small = p.dtype.type(root), p.dtype.type(eps)
     if plain:
         for i in range(p.size):
-            m[i] = c1 * m[i] + (one - c1) * g[i]
-            v[i] = c2 * v[i] + (one - c2) * g[i] * g[i]
+            m[i] = c1 * m[i] + n1 * g[i]
+            v[i] = c2 * v[i] + n2 * g[i] * g[i]
             p[i] -= step * m[i]
     else:
         for i in range(p.size):
-            m[i] = c1 * m[i] + (one - c1) * g[i]
-            v[i] = c2 * v[i] + (one - c2) * g[i] * g[i]
+            m[i] = c1 * m[i] + n1 * g[i]
+            v[i] = c2 * v[i] + n2 * g[i] * g[i]
             p[i] -= step * m[i] / (np.sqrt(v[i]) * scale + small)
 
 
 @reassociating_kernel
-def _square_sum(g: _Array) -> float:
+def _square_sum(g: _Array) -> Any:
     total = g[0] * 0
     for i in range(g.size):
         total += g[i] * g[i]
@@ -146,7 +148,7 @@ class FlatOptimiser:
         first, second = 1 - o.beta1**t, 1 - o.beta2**t
         if o.kind == "adam":
             return learning_rate / first, 1 / math.sqrt(second), o.eps, False
-        # RAdam, Liu et al. (2020), algorithm 2: the variance term is used once its estimate has enough degrees of freedom.
+        # RAdam, Liu et al. (2020), algorithm 2: the variance is used once its estimate has enough degrees of freedom.
         rho_end = 2 / (1 - o.beta2) - 1
         rho = rho_end - 2 * t * o.beta2**t / second
         if rho <= 5.0:

@@ -1,8 +1,8 @@
 """Representations of action values: a table, linear features and the three network layouts of Mitchell (1997), §13.6.
 
 Every class here is a `neuralq.types.QFunction`: ``all(s)`` gives the values of every action, ``at(s, a)`` those of the
-actions named, and the second always equals the first gathered at ``a``. What differs is which estimates one update moves
-along with the one it was meant for, and that is what decides whether training converges.
+actions named, and the second always equals the first gathered at ``a``. What differs is which estimates one update
+moves along with the one it was meant for, and that is what decides whether training converges.
 """
 
 from neuralq.q.bodies import MLP, Conv

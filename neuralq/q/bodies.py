@@ -1,9 +1,9 @@
 """Bodies of the network layouts: an MLP or a small convolutional net, with or without layer normalisation.
 
-A body is described by a frozen dataclass (so that it can stand in a configuration) and built in two parts: a *stem* that
-turns an observation into a vector (nothing for the MLP, convolutions for `Conv`), and a *trunk* of dense layers. Both
-are built with a leading axis of ``copies`` networks that share nothing: `SeparateQ` asks for one copy per action and
-still runs as one batched product per layer.
+A body is described by a frozen dataclass (so that it can stand in a configuration) and built in two parts: a *stem*
+that turns an observation into a vector (nothing for the MLP, convolutions for `Conv`), and a *trunk* of dense layers.
+Both are built with a leading axis of ``copies`` networks that share nothing: `SeparateQ` asks for one copy per action
+and still runs as one batched product per layer.
 
 Weights start as U(±1/√fan_in), biases likewise, drawn from the caller's generator.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -81,7 +82,7 @@ class Trunk(nn.Module):
         self.activation = activation
         layers: list[nn.Module] = []
         norms: list[nn.Module] = []
-        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             layers.append(GroupedLinear(copies, fan_in, fan_out, rng, dtype))
             if layer_norm and i < len(sizes) - 2:
                 norms.append(GroupedLayerNorm(copies, (fan_out,), dtype))
@@ -99,7 +100,7 @@ class Trunk(nn.Module):
 
 
 class GroupedConv(nn.Module):
-    """``copies`` stacks of valid convolutions side by side: ``[B, C, H, W] -> [copies, B, d]`` by grouped convolution."""
+    """``copies`` stacks of valid convolutions side by side, grouped: ``[B, C, H, W] -> [copies, B, d]``."""
 
     def __init__(
         self, copies: int, in_shape: tuple[int, ...], body: Conv, rng: np.random.Generator, dtype: torch.dtype
@@ -129,14 +130,17 @@ class GroupedConv(nn.Module):
 
     def forward(self, s: Tensor) -> Tensor:
         """Convolve every copy's own stack over the same images."""
-        x = s.repeat(1, self.copies, 1, 1)
+        x = s
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = nn.functional.conv2d(x, weight, bias, stride=self.strides[i], groups=self.copies)
+            # The first layer's copies all see the same image, so there a plain convolution is the grouped one.
+            groups = 1 if i == 0 else self.copies
+            x = nn.functional.conv2d(x, weight, bias, stride=self.strides[i], groups=groups)
             if len(self.norms):
-                split = x.reshape(x.shape[0], self.copies, -1, *x.shape[2:]).transpose(0, 1)
+                num_channels = x.shape[1] // self.copies  # not −1: a batch of no observations has no size to infer
+                split = x.reshape(x.shape[0], self.copies, num_channels, *x.shape[2:]).transpose(0, 1)
                 x = self.norms[i](split).transpose(0, 1).reshape(x.shape)
             x = ACTIVATIONS[self.activation](x)
-        return x.reshape(x.shape[0], self.copies, -1).transpose(0, 1)
+        return x.reshape(x.shape[0], self.copies, self.num_features).transpose(0, 1)
 
 
 @dataclass(frozen=True)
@@ -165,9 +169,7 @@ class MLP:
         """No stem: the flattened observation goes straight into the trunk."""
         return None, math.prod(in_shape)
 
-    def trunk(
-        self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype
-    ) -> Trunk:
+    def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
         return Trunk(copies, (fan_in, *self.hidden, fan_out), self.layer_norm, self.activation, rng, dtype)
 
@@ -212,8 +214,6 @@ class Conv:
         stem = GroupedConv(copies, in_shape, self, rng, dtype)
         return stem, stem.num_features
 
-    def trunk(
-        self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype
-    ) -> Trunk:
+    def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
         return Trunk(copies, (fan_in, *self.hidden, fan_out), self.layer_norm, self.activation, rng, dtype)

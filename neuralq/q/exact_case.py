@@ -50,7 +50,7 @@ class LinearQ(nn.Module):
         num_features: d, the length of x(s).
         num_actions: A.
         bias: whether each action has a constant b_a as well.
-        features: module that makes x(s) from an observation; without one the flattened observation is x(s).
+        features: module that makes x(s) from an observation; without one the observation, a vector, is x(s).
         dtype: of the weights, float64 by default. All weights start at 0.
 
     Example:
@@ -77,6 +77,9 @@ class LinearQ(nn.Module):
 
     def _x(self, s: Tensor) -> Tensor:
         x = s if self.features is None else self.features(s)
+        num_features = self.weight.shape[1]
+        if x.shape[-1:] != (num_features,):
+            raise ValueError(f"this function takes {num_features} features, got observations of shape {tuple(x.shape)}")
         return x.to(self.weight.dtype)
 
     def all(self, s: Tensor) -> Tensor:

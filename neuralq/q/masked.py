@@ -38,8 +38,17 @@ class MaskedQ(nn.Module):
         self.width = math.prod(self.observation_shape)
 
     def observation(self, s: Tensor) -> Tensor:
-        """The observation without its mask: ``[*n, d + A] -> [*n, *obs]``."""
-        return s[..., : self.width].reshape(*s.shape[:-1], *self.observation_shape)
+        """The observation without its mask: ``[*n, d + A] -> [*n, *obs]``.
+
+        Raises:
+            ValueError: if the vector is not an observation and one entry per action.
+        """
+        if s.shape[-1:] != (self.width + self.num_actions,):
+            raise ValueError(
+                f"a masked observation has {self.width} entries and {self.num_actions} for the mask, got shape "
+                f"{tuple(s.shape)}; observations without a mask go to the inner Q-function"
+            )
+        return s[..., : self.width].reshape((*s.shape[:-1], *self.observation_shape))
 
     def illegal(self, s: Tensor) -> Tensor:
         """Which actions are not legal: ``[*n, d + A] -> [*n, A]`` bool."""

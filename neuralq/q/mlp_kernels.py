@@ -5,9 +5,12 @@ A small network on a CPU is bound by the framework's cost per operation, not by 
 tests/test_engine.py for every layout, loss, activation and normalisation.
 
 The network is described by ``plan``, one row per layer: fan_in, fan_out, and the offsets in the flat vector of weight
-``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none). Workspaces hold
-for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the normalised pre-activation, ``deltas`` the
-gradient with respect to it; ``inverse`` holds 1/σ of each row.
+``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none). Workspaces
+hold for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the normalised pre-activation,
+``deltas`` the gradient with respect to it; ``inverse`` holds 1/σ of each row.
+
+The two entries call `_forward` and `_backward` in one place each, whatever the layout: every further call is inlined
+and compiled again, and that was half of the seconds that the first use on a machine takes.
 """
 
 from __future__ import annotations
@@ -203,7 +206,7 @@ def _backward(
 
 @reassociating_kernel
 def _pair(pairs: _Array, row: int, x: _Array, i: int, action: int) -> None:
-    """Write state i with a one-hot action. (Loops, here and below: slice assignment doubles the compile time.)"""
+    """Write state i with a one-hot action. Loops, here and below: slice assignment doubles the compile time."""
     width = x.shape[1]
     for j in range(width):
         pairs[row, j] = x[i, j]
@@ -229,25 +232,22 @@ def all_values(
 ) -> None:
     """Action values of every action: rows ``x [B, d]`` into ``out [B, A]``."""
     rows, width = x.shape
-    if layout == ACTION_OUTPUT:
-        q = _forward(params, plan, starts, 0, activation, x, acts, hats, inverse)
+    inputs = x
+    if layout == ACTION_INPUT:
+        inputs = pairs[: rows * num_actions * (width + num_actions)].reshape(rows * num_actions, width + num_actions)
         for i in range(rows):
             for c in range(num_actions):
-                out[i, c] = q[i, c]
-    elif layout == SEPARATE:
-        for c in range(num_actions):
-            q = _forward(params, plan, starts, c, activation, x, acts, hats, inverse)
+                _pair(inputs, i * num_actions + c, x, i, c)
+    for copy in range(num_actions if layout == SEPARATE else 1):
+        q = _forward(params, plan, starts, copy, activation, inputs, acts, hats, inverse)
+        if layout == SEPARATE:
             for i in range(rows):
-                out[i, c] = q[i, 0]
-    else:
-        both = pairs[: rows * num_actions * (width + num_actions)].reshape(rows * num_actions, width + num_actions)
-        for i in range(rows):
-            for c in range(num_actions):
-                _pair(both, i * num_actions + c, x, i, c)
-        q = _forward(params, plan, starts, 0, activation, both, acts, hats, inverse)
-        for i in range(rows):
-            for c in range(num_actions):
-                out[i, c] = q[i * num_actions + c, 0]
+                out[i, copy] = q[i, 0]
+        else:
+            by_action = q.reshape(rows, num_actions)
+            for i in range(rows):
+                for c in range(num_actions):
+                    out[i, c] = by_action[i, c]
 
 
 @reassociating_kernel
@@ -282,49 +282,48 @@ def pull(
     deltas: _Array,
     pairs: _Array,
     q_out: _Array,
-) -> None:
+) -> int:
     """Write the loss's gradient over ``grads`` and Q(s, a) ``[B]`` into ``q_out``.
 
-    The loss is the mean over rows of weight·½(target − Q)² or its Huber form; with ``loss=VALUE`` the gradient is that of
-    Σ weight·Q(s, a).
+    The loss is the mean over rows of weight·½(target − Q)² or its Huber form; with ``loss=VALUE`` the gradient is that
+    of Σ weight·Q(s, a). Returns −1, or the first row whose action does not exist, and then writes nothing.
     """
     rows, width = x.shape
+    for i in range(rows):
+        if a[i] < 0 or a[i] >= num_actions:
+            return i
     for i in range(grads.size):
         grads[i] = 0
     top = starts[plan.shape[0] - 1]
-    if layout == SEPARATE:
-        for c in range(num_actions):
+    outputs = num_actions if layout == ACTION_OUTPUT else 1
+    inputs = x
+    for copy in range(num_actions if layout == SEPARATE else 1):
+        count = rows
+        if layout == SEPARATE:  # this copy sees the samples of its own action
             count = 0
             for i in range(rows):
-                if a[i] == c:
+                if a[i] == copy:
                     for j in range(width):
                         pairs[count * width + j] = x[i, j]
                     count += 1
             if count == 0:
                 continue
-            own = pairs[: count * width].reshape(count, width)
-            q = _forward(params, plan, starts, c, activation, own, acts, hats, inverse)
-            at = 0
+            inputs = pairs[: count * width].reshape(count, width)
+        elif layout == ACTION_INPUT:
+            inputs = pairs[: rows * (width + num_actions)].reshape(rows, width + num_actions)
             for i in range(rows):
-                if a[i] == c:
-                    q_out[i] = q[at, 0]
-                    deltas[count * top + at] = _slope(q[at, 0], target[i], weight[i], loss, delta, rows)
-                    at += 1
-            _backward(params, grads, plan, starts, c, activation, own, acts, hats, inverse, deltas)
-        return
-    inputs = x
-    outputs = num_actions
-    if layout == ACTION_INPUT:
-        outputs = 1
-        inputs = pairs[: rows * (width + num_actions)].reshape(rows, width + num_actions)
+                _pair(inputs, i, x, i, a[i])
+        q = _forward(params, plan, starts, copy, activation, inputs, acts, hats, inverse)
+        slope = deltas[count * top : count * (top + outputs)].reshape(count, outputs)
+        row = 0
         for i in range(rows):
-            _pair(inputs, i, x, i, a[i])
-    q = _forward(params, plan, starts, 0, activation, inputs, acts, hats, inverse)
-    slope = deltas[rows * top : rows * top + rows * outputs].reshape(rows, outputs)
-    for i in range(rows):
-        for j in range(outputs):
-            slope[i, j] = 0
-        c = 0 if layout == ACTION_INPUT else a[i]
-        q_out[i] = q[i, c]
-        slope[i, c] = _slope(q[i, c], target[i], weight[i], loss, delta, rows)
-    _backward(params, grads, plan, starts, 0, activation, inputs, acts, hats, inverse, deltas)
+            if layout == SEPARATE and a[i] != copy:
+                continue
+            for j in range(outputs):
+                slope[row, j] = 0
+            c = a[i] if layout == ACTION_OUTPUT else 0
+            q_out[i] = q[row, c]
+            slope[row, c] = _slope(q[row, c], target[i], weight[i], loss, delta, rows)
+            row += 1
+        _backward(params, grads, plan, starts, copy, activation, inputs, acts, hats, inverse, deltas)
+    return -1
