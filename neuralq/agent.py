@@ -48,20 +48,20 @@ class Agent:
             ``[A]`` float64, −∞ for illegal actions.
 
         Raises:
-            ValueError: if the observation is not what the environment's space promises.
+            ValueError: if the observation or the mask is not what the environment's spaces promise.
         """
+        mask = np.ones(self.spec.num_actions, bool) if action_mask is None else np.asarray(action_mask) != 0
+        if mask.shape != (self.spec.num_actions,):
+            raise ValueError(f"action_mask must have {self.spec.num_actions} entries, got shape {mask.shape}")
         encoded = np.asarray(self.encoder.encode_single(observation))[None]
         if self.spec.masked:
-            mask = np.ones(self.spec.num_actions) if action_mask is None else np.asarray(action_mask)
             flat = np.concatenate([encoded.reshape(1, -1), mask.reshape(1, -1)], axis=1)
             encoded = flat.astype(self.spec.dtype)
         device = next(iter(self.q.parameters())).device  # type: ignore[attr-defined]
         with torch.no_grad():
             q = self.q.all(torch.from_numpy(encoded).to(device))[0]
         values = q.cpu().numpy().astype(np.float64) / self.reward_scale
-        if action_mask is not None and not self.spec.masked:
-            values = np.where(np.asarray(action_mask) != 0, values, -np.inf)
-        return np.asarray(values)
+        return np.where(mask, values, -np.inf)
 
     def predict(self, observation: Any, action_mask: Any = None) -> int:
         """The greedy action for one observation, ready for ``env.step``.

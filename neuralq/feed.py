@@ -1,7 +1,8 @@
 """Feeds: what stands between a stream of experience and a learner, and decides when there is something to learn from.
 
-A feed is filled with every step and asked after each whether there are samples. `RolloutFeed` hands out a rollout ``[T, N]``
-each time one is full, `ReplayFeed` draws from a replay buffer at its period, `OnlineFeed` passes every step on.
+A feed is filled with every step and asked after each whether there are samples. `RolloutFeed` hands out a rollout
+``[T, N]`` each time one is full, `ReplayFeed` draws from a replay buffer at its period, `OnlineFeed` passes every step
+on.
 """
 
 from __future__ import annotations
@@ -68,7 +69,10 @@ class Feed(Protocol):
 
 
 class _Rows:
-    """Preallocated fields ``[T, N]`` with a flag for the entries that hold experience."""
+    """Preallocated fields ``[T, N]`` with a flag for the entries that hold experience.
+
+    Rewards and discounts are float64, so that tables and linear functions learn from the numbers that were meant.
+    """
 
     def __init__(self, num_steps: int, num_lanes: int, spec: ObservationSpec) -> None:
         lead = (num_steps, num_lanes)
@@ -76,8 +80,8 @@ class _Rows:
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.zeros(lead, np.int64),
             np.ones(lead, np.float32),
-            np.zeros(lead, np.float32),
-            np.zeros(lead, np.float32),
+            np.zeros(lead, np.float64),
+            np.zeros(lead, np.float64),
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.ones(lead, bool),
         )
@@ -125,8 +129,8 @@ class RolloutFeed:
         """The rollout, once it is full."""
         if self._at == self._num_steps:
             held = self._rows.held
+            self._at = 0  # before handing out: whoever takes one sample need not ask for another
             yield Sample(self._rows.transition, None if held.all() else torch.from_numpy(held))
-            self._at = 0
 
     def return_errors(self, sample: Sample, errors: Tensor) -> None:
         """Rollouts have no priorities."""
@@ -139,7 +143,9 @@ class RolloutFeed:
     def state_dict(self) -> dict[str, Any]:
         """Nothing: rollouts are kept only while they are collected, and runs stop between them."""
         if self._at:
-            raise ValueError(f"a rollout is half collected ({self._at} of {self._num_steps} rows); save between rollouts")
+            raise ValueError(
+                f"a rollout is half collected ({self._at} of {self._num_steps} rows); save between rollouts"
+            )
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

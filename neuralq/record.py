@@ -40,6 +40,7 @@ __all__ = [
     "read_seed",
     "read_summary",
     "read_versions",
+    "refuse_old_run",
 ]
 
 FORMAT_NAME = "neuralq-run"
@@ -90,7 +91,7 @@ class RunFolder:
         path.mkdir(parents=True, exist_ok=True)
         run = cls(path, _lock(path))
         try:
-            _refuse_old_run(path)
+            refuse_old_run(path)
             _write_durably(path / "config.json", document)
             _write_durably(path / "versions.json", _strict_json(library_versions(), "versions"))
             marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seed": int(seed)}
@@ -166,6 +167,11 @@ class RunFolder:
         if len(kept) < len(rows):
             _write_durably(self.metrics_path, "".join(json.dumps(row) + "\n" for row in kept))
         return len(rows) - len(kept)
+
+    def replace_config(self, config: Mapping[str, Any]) -> None:
+        """The effective configuration from now on (a resumed run may have a new budget), replaced in one step."""
+        self._check_open()
+        _write_durably(self.path / "config.json", _strict_json(dict(config), "config"))
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """The final result, replaced in one step; NaN and infinities become null.
@@ -307,7 +313,8 @@ def _read_marker(path: Path) -> dict[str, Any]:
     return marker
 
 
-def _refuse_old_run(path: Path) -> None:
+def refuse_old_run(path: Path) -> None:
+    """Raises `RunFolderError` if there is a run in ``path``, whole or in part."""
     for name in ("run.json", "metrics.jsonl", "checkpoints", "summary.json"):
         if (path / name).exists():
             raise RunFolderError(
@@ -353,9 +360,7 @@ def _plain(value: Any, place: str) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(v, f"{place}[{i}]") for i, v in enumerate(value)]
     if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
-        value = value.item()
-        if isinstance(value, str | bool):
-            return value
+        return _plain(value.item(), place)
     if isinstance(value, Integral):
         return int(value)
     if isinstance(value, Real):

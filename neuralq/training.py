@@ -122,6 +122,7 @@ class Progress:
     next_checkpoint: int = 0
     next_log: int = 0
     recent_returns: list[float] = field(default_factory=list)
+    last_metrics: dict[str, float] = field(default_factory=dict)
     interrupted_by: str | None = None
 
 
@@ -270,6 +271,10 @@ class _Loop:
         for hook in self.hooks:
             hook(row)
 
+    def _last_metrics(self) -> dict[str, float]:
+        """Of the last update, which may have been before the run was resumed."""
+        return self.progress.last_metrics if self.last_update is None else self.last_update.metrics()
+
     def _log(self) -> None:
         self._stop_clock()
         progress = self.progress
@@ -285,9 +290,7 @@ class _Loop:
             "episode_return": float(np.mean(self.recent)) if self.recent else None,
             "num_updates": self.session.learner.num_updates,
         }
-        if self.last_update is not None:
-            row |= self.last_update.metrics()
-        self._record(row)
+        self._record(row | self._last_metrics())
 
     def _evaluate(self) -> None:
         self._stop_clock()
@@ -315,6 +318,7 @@ class _Loop:
     def _save(self) -> None:
         progress = self.progress
         progress.recent_returns = list(self.recent)
+        progress.last_metrics = self._last_metrics()
         period = self.plan.checkpoint_every
         progress.next_checkpoint = (progress.env_steps // period + 1) * period
         _refuse_divergence(self.session, progress)

@@ -1,4 +1,4 @@
-"""The command line. This module imports nothing heavy: ``neuralq --help`` answers at once, each command loads its own."""
+"""The command line. Nothing heavy is imported here: ``neuralq --help`` answers at once."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import importlib
 import json
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,10 +49,17 @@ def print_result(result: dict[str, Any], as_json: bool, lines: Sequence[str]) ->
         print(line, flush=True)
 
 
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
+) -> None:
+    """A warning for whoever typed the command: what it says, not where in the code."""
+    print(f"neuralq: warning: {message}", file=sys.stderr)
+
+
 def _top_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="neuralq",
-        description="Learn value functions, beside the exact answer, and know before training whether an update converges.",
+        description="Learn value functions beside the exact answer, and know before training what converges.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -67,13 +75,18 @@ def _top_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] not in COMMANDS:
+    if not arguments:
+        _top_parser().print_help(sys.stderr)
+        return 2
+    if arguments[0] not in COMMANDS:
         _top_parser().parse_args(arguments)
         return 2  # not reached: argparse has ended the process with help or an error
     module, function, _ = COMMANDS[arguments[0]]
-    command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
     try:
-        return command(arguments[1:])
+        command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return command(arguments[1:])
     except Failure as failure:
         print(f"neuralq: {failure}", file=sys.stderr)
         return failure.status

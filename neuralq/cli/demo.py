@@ -1,4 +1,4 @@
-"""``neuralq demo`` and ``neuralq baird``: a network that learns, and a divergence that is predicted before it happens."""
+"""``neuralq demo`` and ``neuralq baird``: a network that learns, and a divergence predicted before it happens."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def demo(argv: list[str]) -> int:
     """Learn CartPole, run Baird's star, write one page about both."""
     parser = argparse.ArgumentParser(
         prog="neuralq demo",
-        description="Learn CartPole-v1 by TD(λ), predict and measure divergence on Baird's star, write a page about both.",
+        description="Learn CartPole-v1 by TD(λ), predict and measure divergence on Baird's star, write a page on both.",
         epilog="example:\n  neuralq demo --seed 1",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -60,7 +60,9 @@ def demo(argv: list[str]) -> int:
 
 
 def _cartpole(path: Path, seed: int, console: Console) -> Run:
-    console.print("[bold]1. CartPole-v1 by TD(λ)[/bold]: one output per action, λ-returns over 32 parallel environments")
+    console.print(
+        "[bold]1. CartPole-v1 by TD(λ)[/bold]: one output per action, λ-returns over 32 parallel environments"
+    )
     console.print("   preparing (the first run on a machine compiles kernels, about half a minute)")
     if is_run_folder(path):
         shutil.rmtree(path)
@@ -100,7 +102,9 @@ def baird(argv: list[str]) -> int:
 def _star(
     console: Console, num_steps: int, gamma: float, step_size: float, num_upper: int
 ) -> tuple[list[BairdPrediction], list[BairdResult]]:
-    console.print(f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained")
+    console.print(
+        f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained"
+    )
     predictions = predict_baird(gamma, step_size, num_upper)
     for p in predictions:
         console.print(f"   {p.representation:<14} ×{p.growth:.7f} per sweep: {p.verdict} ({p.scope})", highlight=False)

@@ -24,14 +24,14 @@ def solve(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="neuralq solve",
         description="Compute V* and every optimal action of an environment with a transition table.",
-        epilog="examples:\n  neuralq solve FrozenLake-v1 --gamma 0.95\n  neuralq solve neuralq/MitchellGrid-v0 --gamma 0.9",
+        epilog="examples:\n  neuralq solve FrozenLake-v1\n  neuralq solve neuralq/MitchellGrid-v0 --gamma 0.9",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("env", help="Gymnasium id of an environment with a transition table P, or one of neuralq's")
     parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99)")
     parser.add_argument("--method", default="value-iteration", choices=("value-iteration", "policy-iteration"))
     parser.add_argument("--tol", type=float, default=1e-8, help="guaranteed largest error of V (default: 1e-8)")
-    parser.add_argument("--env-kwargs", type=json.loads, default={}, help="JSON object passed to gymnasium.make")
+    parser.add_argument("--env-kwargs", type=_json_object, default={}, help="JSON object passed to gymnasium.make")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     options = parser.parse_args(argv)
     mdp = _model(options.env, options.env_kwargs)
@@ -51,6 +51,16 @@ def solve(argv: list[str]) -> int:
     if not solution.converged:
         raise Failure(f"did not converge: the error may be as large as {solution.bound:.3g}; allow a larger --tol")
     return 0
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"must be a JSON object such as '{{\"is_slippery\": false}}', got {text!r}")
+    return value
 
 
 def _model(env_id: str, kwargs: dict[str, Any]) -> FiniteMDP:

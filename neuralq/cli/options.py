@@ -3,27 +3,50 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
+import json
 import re
 from collections.abc import Sequence
-from dataclasses import MISSING, fields
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, NoReturn, get_args, get_type_hints
 
-import yaml
-from jsonargparse import ActionConfigFile, ArgumentParser, Namespace
+import yaml  # type: ignore[import-untyped]
+from jsonargparse import ArgumentParser
 
+from neuralq.cli import Failure
 from neuralq.recipes import RunConfig, preset_for
-from neuralq.recipes.config import LAYOUTS, LEARNERS, config_from_dict
+from neuralq.recipes.config import LAYOUTS, LEARNERS, NETWORKS, config_from_dict, config_to_dict
 
-__all__ = ["hyphenated", "parse_train"]
+__all__ = ["TrainOptions", "hyphenated", "parse_train"]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
   neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
+  neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
   neuralq train my_package:MyEnv-v0 --rollout.lambda 0.8 --hidden 64,64
-  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml"""
+  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
-_SKIPPED = {"env", "env_kwargs", "body", *LEARNERS}
-_HELP: dict[str, str] = {}
+_OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
+_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "print_config"}
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "dict": "a mapping"}
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What was asked for on the command line, beside the configuration of the run.
+
+    Args:
+        run_dir: folder for the run, or None for one of its own.
+        tensorboard: whether to write event files.
+        json: whether to print the result as JSON.
+        preset: whether a preset gave defaults.
+    """
+
+    run_dir: str | None
+    tensorboard: bool
+    json: bool
+    preset: bool
 
 
 def hyphenated(argv: Sequence[str]) -> list[str]:
@@ -36,7 +59,7 @@ def hyphenated(argv: Sequence[str]) -> list[str]:
     out = []
     for token in argv:
         match = re.fullmatch(r"--([A-Za-z][\w.-]*)(=.*)?", token, re.DOTALL)
-        if match is None or match[1] == "print_config":
+        if match is None:
             out.append(token)
             continue
         name = re.sub(r"(^|\.)lambda$", r"\1lambda_", match[1].replace("-", "_"))
@@ -44,125 +67,196 @@ def hyphenated(argv: Sequence[str]) -> list[str]:
     return out
 
 
+def _as_typed(text: str) -> str:
+    """Option names in a text of the parser's, with hyphens."""
+    return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text).replace(
+        "--print-config", "--print_config"
+    )
+
+
 class _Parser(ArgumentParser):
-    """Shows option names with hyphens, as they are typed."""
+    """Answers wrong usage with one line instead of the list of all options."""
 
-    def format_help(self) -> str:
-        text: str = super().format_help()
-        names = re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-") if m[0] != "--print_config" else m[0], text)
-        return names
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        raise Failure(f"{_in_one_line(message)}; `neuralq train --help` lists the options", 2) from ex
 
 
-def _field_help() -> dict[str, str]:
-    """What each field of `RunConfig` is for, read from its docstring, so that it is written once."""
-    block = (RunConfig.__doc__ or "").split("Args:")[1]
+def _in_one_line(message: str) -> str:
+    key = re.match(r'Parser key "([\w.]+)":', message)
+    got = re.findall(r"(?:Got value|Given value): (.*)", message)
+    if key is None or not got:
+        return _as_typed(" ".join(message.split()))
+    kinds = dict.fromkeys(re.findall(r"<class '(\w+)'>", message.split("Given value")[0]))
+    expected = " or ".join(_WORDS.get(kind, kind) for kind in kinds if kind != "NoneType")
+    name = _as_typed(f"--{key[1]}")
+    return f"{name} must be {expected}, got {got[-1]}" if expected else f"{name}: cannot use {got[-1]}"
+
+
+def _with_env_named(argv: Sequence[str]) -> list[str]:
+    """The one word that is neither an option nor the value of one is the environment, wherever it stands."""
+    out: list[str] = []
+    takes_value = False
+    for token in argv:
+        is_option = token.startswith("-") and not re.fullmatch(r"-\.?\d.*", token)
+        if not is_option and not takes_value:
+            out.append("--env")
+        out.append(token)
+        takes_value = is_option and "=" not in token and token.lstrip("-") not in _WITHOUT_VALUE
+    if out.count("--env") > 1:
+        words = [value for name, value in itertools.pairwise(out) if name == "--env"]
+        raise Failure(f"one environment at a time, got {' and '.join(map(repr, words))}", 2)
+    return out
+
+
+def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list[str]]:
+    """What decides which options there are, the configuration file's content, and the rest of the command line."""
+    light = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    light.add_argument("--config")
+    _, rest = light.parse_known_args(list(argv))
+    for name in ("env", "learner", "layout", "preset"):
+        light.add_argument(f"--{name}")
+    try:
+        known, _ = light.parse_known_args(list(argv))
+    except argparse.ArgumentError as error:
+        raise Failure(f"{error}; `neuralq train --help` lists the options", 2) from error
+    file = {} if known.config is None else _read_file(known.config)
+    for name, default in (("env", ""), ("learner", RunConfig.learner), ("layout", RunConfig.layout)):
+        setattr(known, name, getattr(known, name) or file.get(name) or default)
+    if known.learner not in LEARNERS:  # refused with the right words later
+        known.learner = RunConfig.learner
+    return known, file, rest
+
+
+def _read_file(path: str) -> dict[str, Any]:
+    try:
+        with open(path, encoding="utf-8") as stream:
+            content = yaml.safe_load(stream)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
+    content = {} if content is None else content
+    if not isinstance(content, dict):
+        raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
+    known = [f.name for f in fields(RunConfig)]
+    for name in content:
+        if name not in known:
+            close = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+            raise Failure(f"--config {path} has the unknown key {name!r}; {hint}", 2)
+    return content
+
+
+def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
+    for token in argv:
+        other = re.match(r"--(\w+)[.=]", token)
+        if other is not None and other[1] in LEARNERS and other[1] != learner:
+            option = _as_typed(token.split("=")[0])
+            raise Failure(
+                f"{option} is for the {other[1]} learner, and this is a {learner} run: "
+                f"add --learner {other[1]} or leave it out",
+                2,
+            )
+
+
+def _field_help(settings: type) -> dict[str, str]:
+    """What each field of a dataclass is for, read from its docstring, so that it is written once."""
+    block = (settings.__doc__ or "").split("Args:")[1]
     return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
 
 
-def _peek(argv: Sequence[str]) -> tuple[str, str]:
-    """Environment and learner, which decide the preset and the learner's options, before the real parsing."""
-    light = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    light.add_argument("--env")
-    light.add_argument("--learner")
-    light.add_argument("--config")
-    known, _ = light.parse_known_args(list(argv))
-    file: Any = {}
-    if known.config is not None:
-        with open(known.config, encoding="utf-8") as stream:
-            file = yaml.safe_load(stream) or {}
-        if not isinstance(file, dict):
-            raise ValueError(f"{known.config} must hold a mapping of options, got {type(file).__name__}")
-    learner = known.learner or file.get("learner", "rollout")
-    return known.env or file.get("env", ""), learner if learner in LEARNERS else "rollout"
+def _add_fields(parser: Any, settings: type[Any], prefix: str, preset: dict[str, Any]) -> None:
+    texts, types = _field_help(settings), get_type_hints(settings)
+    for f in fields(settings):
+        if prefix or f.name not in _OWN_PARSING:
+            default = preset.get(f.name, f.default)
+            words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
+            kind = next((k for k in (types[f.name], *get_args(types[f.name])) if k in words), str)
+            text = f"{texts[f.name].rstrip('.')} (default: {'none' if default is None else default})".replace("%", "%%")
+            parser.add_argument(f"--{prefix}{f.name}", type=types[f.name], metavar=words[kind], help=text)
 
 
 def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
     parser = _Parser(
-        prog="neuralq train ENV",
+        prog="neuralq train",
+        usage="neuralq train ENV [options]",
         description="Train on a Gymnasium environment by TD(λ). ENV is a registered id, or module:id for your own.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        print_config=None,
     )
-    texts = _field_help()
-    parser.add_argument("--config", action=ActionConfigFile, help="YAML file of options, as --print_config writes it")
-    parser.add_argument("--env", type=str, help=argparse.SUPPRESS)
-    parser.add_argument("--env_kwargs", type=dict, default={}, help=texts["env_kwargs"])
-    for f in fields(RunConfig):
-        if f.name in _SKIPPED:
-            continue
-        kind: Any = {"learner": None, "layout": None}.get(f.name, _types()[f.name])
-        default = None if f.default is MISSING else f.default
-        if f.name == "learner":
-            parser.add_argument("--learner", choices=tuple(LEARNERS), default=learner, help=texts[f.name])
-        elif f.name == "layout":
-            parser.add_argument("--layout", choices=LAYOUTS, default=default, help=texts[f.name])
-        else:
-            parser.add_argument(f"--{f.name}", type=kind, default=default, help=f"{texts[f.name]} (default: {default})")
-    parser.add_argument("--body", type=dict | None, help="network body as a mapping, e.g. '{class: Conv, channels: [16]}'")
-    parser.add_argument("--hidden", type=str, help="widths of the hidden layers, e.g. 64,64")
-    parser.add_argument("--layer_norm", type=bool | None, help="layer normalisation in the network: true or false")
-    parser.add_argument("--activation", type=str, help="relu, tanh or leaky_relu")
-    parser.add_class_arguments(LEARNERS[learner], learner, help=f"options of the {learner} learner")
-    parser.add_argument("--run_dir", type=str, help="folder for the run (default: one under runs/, named after it)")
-    parser.add_argument("--preset", type=bool, default=True, help="use the environment's preset (default: true)")
-    parser.add_argument("--tensorboard", type=bool, default=False, help="write TensorBoard event files (extra tensorboard)")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
-    parser.set_defaults(_flattened({k: v for k, v in preset.items() if k != "body"}))
-    if "body" in preset:
-        parser.set_defaults({"body": preset["body"]})
+    add = parser.add_argument
+    add("--env", type=str, help=argparse.SUPPRESS)
+    add("--env_kwargs", type=dict, metavar="MAPPING", help="JSON or YAML mapping passed to gymnasium.make")
+    add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
+    add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
+    _add_fields(parser, RunConfig, "", preset)
+    add("--body", type=dict | None, metavar="MAPPING", help="network body, e.g. '{class: MLP, hidden: [64]}'")
+    add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
+    add("--layer_norm", type=bool | None, metavar="{true,false}", help="layer normalisation in the network")
+    add("--activation", type=str, metavar="NAME", help="relu, tanh or leaky_relu")
+    add("--config", type=str, metavar="FILE", help="YAML file of options, as --print_config writes it")
+    add("--print_config", action="store_true", help="print the resulting configuration and exit")
+    add("--run_dir", type=str, metavar="FOLDER", help="where the run goes (default: a folder under runs/)")
+    add(
+        "--preset",
+        type=bool,
+        metavar="{true,false}",
+        help="whether to start from the environment's preset (default: true)",
+    )
+    add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
+    add("--json", action="store_true", help="print the result as one JSON object on the last line")
+    group = parser.add_argument_group(f"options of the {learner} learner")
+    _add_fields(group, LEARNERS[learner], f"{learner}.", preset.get(learner, {}))
     return parser
 
 
-def _types() -> dict[str, Any]:
-    from typing import get_type_hints
-
-    return get_type_hints(RunConfig)
-
-
-def _flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            flat |= _flattened(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
-
-
-def parse_train(argv: Sequence[str]) -> tuple[RunConfig, Namespace, bool]:
-    """The configuration asked for, the options that are not part of it, and whether a preset gave defaults.
+def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
+    """The configuration asked for and the other options; None where printing the options or that was all.
 
     Raises:
-        ValueError: for contradictions.
-        SystemExit: for help and unknown options, as argparse does.
+        Failure: for unknown options, values of the wrong kind and contradictions, with exit status 2.
     """
-    argv = hyphenated(argv)
-    # A flag with a value of its own would otherwise need "--json true".
-    if argv and not argv[0].startswith("-"):
-        argv = ["--env", *argv]
-    env, learner = _peek(argv)
-    wanted = "--preset=false" not in argv and not ("--preset" in argv and argv[argv.index("--preset") + 1 :][:1] == ["false"])
-    preset = preset_for(env, learner) if wanted else {}
-    parsed = _build(learner, preset).parse_args(argv)
-    if not parsed.env:
-        raise ValueError("name an environment, e.g. neuralq train CartPole-v1")
-    values = parsed.as_dict()
-    extra = Namespace(**{name: values.pop(name) for name in ("run_dir", "tensorboard", "json", "preset")})
-    values.pop("config", None)
-    _shorthands(values)
-    return config_from_dict(values), extra, bool(preset)
+    argv = _with_env_named(hyphenated(argv))
+    known, file, rest = _peek(argv)
+    preset = preset_for(known.env, known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
+    if known.layout not in NETWORKS:  # a preset's body is for networks
+        preset = {name: value for name, value in preset.items() if name != "body"}
+    if {"-h", "--help"} & set(rest):
+        print(_as_typed(_build(known.learner, preset).format_help()))
+        return None
+    _refuse_other_learners(rest, known.learner)
+    given = _build(known.learner, preset).parse_args(rest, defaults=False).as_dict()
+    run_dir, tensorboard, as_json = (
+        given.pop("run_dir", None),
+        given.pop("tensorboard", False),
+        given.pop("json", False),
+    )
+    printed = given.pop("print_config", False)
+    given.pop("preset", None)
+    try:
+        config = config_from_dict(_merged(known.learner, preset, file, given))
+    except ValueError as error:
+        raise Failure(str(error), 2) from error
+    if printed:
+        print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
+        return None
+    return config, TrainOptions(run_dir, tensorboard, as_json, bool(preset))
 
 
-def _shorthands(values: dict[str, Any]) -> None:
-    """Fold --hidden, --layer-norm and --activation into the body."""
-    short = {name: values.pop(name) for name in ("hidden", "layer_norm", "activation")}
-    given = {name: value for name, value in short.items() if value is not None}
-    if "hidden" in given:
+def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Preset, file and command line, the later winning; settings of the learner one by one, everything else whole."""
+    short = {name: given.pop(name) for name in ("hidden", "layer_norm", "activation") if given.get(name) is not None}
+    values = {**preset, **file, **given}
+    if not values.get("env"):
+        raise Failure("name an environment, e.g. neuralq train CartPole-v1", 2)
+    layers = [layer.get(learner) or {} for layer in (preset, file, given)]
+    if all(isinstance(layer, dict) for layer in layers):
+        values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    if "hidden" in short:
         try:
-            given["hidden"] = [int(width) for width in re.split(r"[,\s]+", given["hidden"].strip("[] "))]
+            short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]
         except ValueError as error:
-            raise ValueError(f"--hidden takes whole numbers like 64,64, got {short['hidden']!r}") from error
-    if given:
-        values["body"] = {"class": "MLP", **(values.get("body") or {}), **given}
-    elif values["layout"] in ("table", "linear"):
-        values["body"] = None  # a preset's body is for networks
+            raise Failure(f"--hidden takes whole numbers like 64,64, got {short['hidden']!r}", 2) from error
+    if short:
+        values["body"] = {"class": "MLP", **(values.get("body") or {}), **short}
+    return values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
 from datetime import datetime
@@ -17,7 +18,7 @@ from neuralq.recipes import Run, evaluate_run
 from neuralq.recipes import resume as resume_run
 from neuralq.recipes import train as train_run
 from neuralq.recipes.config import config_from_dict
-from neuralq.record import default_run_path, read_config
+from neuralq.record import default_run_path, read_config, refuse_old_run
 from neuralq.report import MissingExtra, write_report
 from neuralq.training import Hook
 
@@ -26,29 +27,39 @@ __all__ = ["evaluate", "report", "resume", "train"]
 
 def train(argv: list[str]) -> int:
     """Train as the options say; exit status 0 only if the target was reached, where one was set."""
-    config, extra, preset = parse_train(argv)
-    path = Path(extra.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
-    _say(f"run folder {path}" + (f"; preset for {config.env}" if preset else "") + "; preparing (kernels compile once)")
-    hooks: list[Hook] = []
-    board = TensorBoard(path / "tensorboard") if extra.tensorboard else None
-    if board is not None:
-        hooks.append(board)
-    with ProgressBar(config.total_steps, config.stop_at_return) as bar:
-        run = train_run(config, path, [*hooks, bar])
-    if board is not None:
-        board.close()
-    return _conclude(run, extra.json, config.stop_at_return)
+    parsed = parse_train(argv)
+    if parsed is None:
+        return 0
+    config, options = parsed
+    path = Path(options.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
+    refuse_old_run(path)  # also by train_run, but preparing takes seconds
+    preset = f"; preset for {config.env}" if options.preset else ""
+    _say(f"run folder {path}{preset}; preparing (the first run on a machine compiles kernels)")
+    with contextlib.ExitStack() as stack:
+        hooks: list[Hook] = []
+        if options.tensorboard:
+            hooks.append(stack.enter_context(contextlib.closing(TensorBoard(path / "tensorboard"))))
+        hooks.append(stack.enter_context(ProgressBar(config.total_steps, config.stop_at_return)))
+        run = train_run(config, path, hooks)
+    return _conclude(run, options.json, config.stop_at_return)
 
 
 def resume(argv: list[str]) -> int:
     """Go on with a run."""
-    parser = _parser("resume", "Go on with a run from its newest intact checkpoint.", "neuralq resume runs/demo/cartpole")
+    parser = _parser(
+        "resume", "Go on with a run from its newest intact checkpoint.", "neuralq resume runs/demo/cartpole"
+    )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--total-steps", type=int, help="a new budget; lets a finished run go on")
     options = parser.parse_args(argv)
     config = config_from_dict(read_config(options.run))
-    with ProgressBar(options.total_steps or config.total_steps, config.stop_at_return) as bar:
-        run = resume_run(options.run, options.total_steps, [bar])
+    board = Path(options.run) / "tensorboard"
+    with contextlib.ExitStack() as stack:
+        hooks: list[Hook] = []
+        if board.is_dir():  # the run was started with --tensorboard
+            hooks.append(stack.enter_context(contextlib.closing(TensorBoard(board))))
+        hooks.append(stack.enter_context(ProgressBar(options.total_steps or config.total_steps, config.stop_at_return)))
+        run = resume_run(options.run, options.total_steps, hooks)
     return _conclude(run, options.json, config.stop_at_return)
 
 

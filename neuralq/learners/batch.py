@@ -1,7 +1,7 @@
 """Q-learning from stored experience: one-step, n-step and double targets, or λ-returns over contiguous blocks.
 
-One-step and n-step samples come ready from the replay buffer (its discount is that of the whole stretch), so the same rule
-serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in DQN(λ) (Daley & Amato, 2019).
+One-step and n-step samples come ready from the replay buffer (its discount is that of the whole stretch), so the same
+rule serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in DQN(λ) (Daley & Amato, 2019).
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
+from neuralq.learners.bootstrap import q_learning_targets
 from neuralq.learners.update import Descent, Update
 from neuralq.optim import Optimiser
 from neuralq.q.engine import Engine
@@ -79,9 +81,17 @@ class ReplaySettings:
                 '("peng", "watkins") need blocks of at least 2 rows, the other rules take single samples'
             )
         if blocks and (self.num_steps > 1 or self.prioritised):
-            raise ValueError("λ-returns over blocks replace n-step targets and priorities; leave num_steps=1, prioritised=False")
+            raise ValueError(
+                "λ-returns over blocks replace n-step targets and priorities; leave num_steps=1, prioritised=False"
+            )
         if blocks and self.batch_size < self.block_length:
             raise ValueError(f"batch_size={self.batch_size} holds no block of block_length={self.block_length}")
+        for name in ("learning_starts", "capacity"):
+            if blocks and getattr(self, name) < self.block_length * self.num_envs:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} steps over {self.num_envs} environment(s) hold no block of "
+                    f"block_length={self.block_length}; take at least {self.block_length * self.num_envs}"
+                )
 
 
 class ReplayLearner:
@@ -111,15 +121,17 @@ class ReplayLearner:
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
         engine.sync_target()
+        one = torch.ones(1, dtype=engine.flat.values.dtype)
+        q_learning_targets(one, one, one[:, None])  # compiled here, so that a run's clock measures training
 
     def targets(self, transition: Transition) -> Tensor:
         """Targets of the chosen rule, with the shape of ``r_t``."""
         q_t = self.engine.all(transition.s_t, target=True)
-        r_t = transition.r_t.to(q_t.dtype) * self.reward_scale
-        discount_t = transition.discount_t.to(q_t.dtype)
         rule = self.settings.target_rule
         if rule == "q_learning":
-            return rules.q_learning(r_t, discount_t, q_t)
+            return q_learning_targets(transition.r_t, transition.discount_t, q_t, self.reward_scale)
+        r_t = transition.r_t.to(q_t.dtype) * self.reward_scale
+        discount_t = transition.discount_t.to(q_t.dtype)
         if rule == "double":
             return rules.double_q(r_t, discount_t, q_t, self.engine.all(transition.s_t))
         lambda_: Tensor | float = self.settings.lambda_
@@ -129,11 +141,12 @@ class ReplayLearner:
         return rules.lambda_returns(r_t, discount_t, q_t.amax(-1), lambda_, transition.last_t)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
-        """One descent step on a batch; ``weight`` multiplies each sample's loss."""
+        """One descent step on a batch; ``weight``, shaped like ``r_t``, multiplies each sample's loss."""
         targets = self.targets(transition)
         s, a = transition.s_tm1, transition.a_tm1
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
+            weight = None if weight is None else weight.reshape(-1)
         errors = self._descent.step(s, a, targets, weight)
         self.num_updates += 1
         if self.num_updates % self.settings.target_period_updates == 0:

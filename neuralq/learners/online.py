@@ -1,9 +1,9 @@
 """TD(λ) in the backward view: one step at a time with eligibility traces, on any representation.
 
 The trace z remembers which weights the recent predictions came from; each TD error moves them all. Three facts decide
-whether that is right, and each is an index: the trace decays by the discount *into* s_tm1 (that of the previous transition),
-an exploring action cuts it *before* its own gradient is added (Watkins, 1989), and it is dropped *after* the last step of a
-stream. With values held fixed over an episode the increments add up to those of the forward view, to rounding.
+whether that is right, and each is an index: the trace decays by the discount *into* s_tm1 (that of the previous
+transition), an exploring action cuts it *before* its own gradient is added (Watkins, 1989), and it is dropped *after*
+the last step of a stream. With values held fixed over an episode the increments add up to those of the forward view.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ class OnlineSettings:
         check_positive("step_size", self.step_size)
         check_choice("trace", self.trace, ("accumulating", "replacing", "dutch"))
         check_choice("cut", self.cut, ("watkins", "naive"))
+        if self.trace == "dutch" and self.cut == "naive":
+            raise ValueError("the true online increment is not derived for uncut Q(λ); leave cut='watkins'")
 
 
 class _Traces:
@@ -153,7 +155,8 @@ class OnlineLearner:
         >>> learner = OnlineLearner(TorchEngine(TableQ(3, 1), Loss()), settings)
         >>> def step(s, r, s_next, last):
         ...     row = torch.tensor
-        ...     return Transition(row([s]), row([0]), row([1.0]), row([r]), row([0.0 if last else 1.0]), row([s_next]), row([last]))
+        ...     discount = 0.0 if last else 1.0
+        ...     return Transition(*map(row, ([s], [0], [1.0], [r], [discount], [s_next], [last])))
         >>> _ = learner.update(step(0, 0.0, 1, False))
         >>> _ = learner.update(step(1, 8.0, 2, True))
         >>> learner.engine.all(torch.arange(3))[:, 0].tolist()

@@ -1,7 +1,7 @@
-"""TD(λ) in the forward view: λ-returns over a rollout of parallel environments, fitted for a few epochs, then forgotten.
+"""TD(λ) in the forward view: λ-returns over a rollout of parallel streams, fitted for a few epochs, then forgotten.
 
-The method is PQN (Gallici et al., 2024): Peng's Q(λ) with neither replay nor, by default, a target network. Watkins' returns
-cut λ at exploring actions. Values are computed once per rollout, with the parameters that collected it.
+The method is PQN (Gallici et al., 2024): Peng's Q(λ) with neither replay nor, by default, a target network. Watkins'
+returns cut λ at exploring actions. Values are computed once per rollout, with the parameters that collected it.
 """
 
 from __future__ import annotations
@@ -65,9 +65,8 @@ class RolloutSettings:
         if self.target_period_updates is not None:
             check_whole("target_period_updates", self.target_period_updates)
         if self.num_minibatches > self.num_envs * self.num_steps:
-            raise ValueError(
-                f"num_minibatches={self.num_minibatches} exceeds the {self.num_envs * self.num_steps} samples of a rollout"
-            )
+            rows = self.num_envs * self.num_steps
+            raise ValueError(f"num_minibatches={self.num_minibatches} exceeds the {rows} samples of a rollout")
 
 
 class RolloutLearner:
@@ -87,7 +86,8 @@ class RolloutLearner:
         ...                            optimiser="sgd", learning_rate=1.0)
         >>> learner = RolloutLearner(TorchEngine(TableQ(2, 1), Loss()), settings, np.random.default_rng(0))
         >>> one = torch.ones(1, 1)
-        >>> step = Transition(torch.tensor([[0]]), torch.tensor([[0]]), one, 5 * one, 0 * one, torch.tensor([[1]]), one > 0)
+        >>> s_tm1, a_tm1, s_t = torch.tensor([[0]]), torch.tensor([[0]]), torch.tensor([[1]])
+        >>> step = Transition(s_tm1, a_tm1, one, 5 * one, 0 * one, s_t, one > 0)
         >>> learner.update(step).errors.item(), learner.engine.all(torch.tensor(0)).item()
         (5.0, 5.0)
     """

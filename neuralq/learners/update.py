@@ -43,7 +43,11 @@ class Learner(Protocol):
     """What training asks of a learner."""
 
     engine: Engine
-    num_updates: int
+
+    @property
+    def num_updates(self) -> int:
+        """How many updates there have been."""
+        ...
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from experience; ``weight`` has one entry per row, 0 for rows that are no experience."""
@@ -72,9 +76,7 @@ class Descent:
         max_grad_norm: bound on the gradient's Euclidean norm; None for no bound.
     """
 
-    def __init__(
-        self, engine: Engine, optimiser: Optimiser, learning_rate: float, max_grad_norm: float | None
-    ) -> None:
+    def __init__(self, engine: Engine, optimiser: Optimiser, learning_rate: float, max_grad_norm: float | None) -> None:
         check_positive("learning_rate", learning_rate)
         if max_grad_norm is not None:
             check_positive("max_grad_norm", max_grad_norm)

@@ -35,7 +35,11 @@ from neuralq.types import QFunction, Transition
 
 __all__ = ["build_q", "build_session", "make_envs", "plan_of"]
 
-_NETWORKS = {"action-input": ActionInputQ, "separate": SeparateQ, "action-output": ActionOutputQ}
+_NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]] = {
+    "action-input": ActionInputQ,
+    "separate": SeparateQ,
+    "action-output": ActionOutputQ,
+}
 
 
 def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
@@ -86,7 +90,9 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     elif spec.dtype == np.uint8:
         features = Pixels()
     if config.layout == "linear":
-        flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape))) if len(shape) > 1 else features
+        flat = features
+        if len(shape) > 1:
+            flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape)))
         # One-hot features already span the constant; a bias would make the weights redundant.
         q = LinearQ(int(np.prod(shape)), spec.num_actions, bias=num_categories is None, features=flat)
     else:
@@ -101,6 +107,7 @@ def build_session(config: RunConfig) -> Session:
     Raises:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
+    _check_device(config.device)
     settings = config.settings
     num_envs = getattr(settings, "num_envs", 1)
     envs = make_envs(config, num_envs)
@@ -123,6 +130,16 @@ def build_session(config: RunConfig) -> Session:
     )
     _warm(engine, stream, settings)
     return Session(stream, policy, feed, learner, generators, evaluation, probe)
+
+
+def _check_device(device: str) -> None:
+    try:
+        usable = torch.zeros(1, device=device).add(1).item() == 1  # a device may be known and still not there
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().split("\n")[0]
+        raise ValueError(f"cannot compute on device {device!r}: {reason}; device='cpu' always works") from error
+    if not usable:
+        raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works")
 
 
 def _learner(config: RunConfig, engine: Engine, rng: np.random.Generator) -> Learner:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from numbers import Real
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
@@ -20,6 +22,8 @@ LEARNERS: dict[str, type[RolloutSettings] | type[ReplaySettings] | type[OnlineSe
     "online": OnlineSettings,
 }
 NETWORKS = ("action-input", "separate", "action-output")
+BODIES: dict[str, type[MLP] | type[Conv]] = {"MLP": MLP, "Conv": Conv}
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,10 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range and settings that would be ignored; fill in the learner's defaults."""
+        for name, value in _fitted(
+            "", {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}, RunConfig
+        ).items():
+            object.__setattr__(self, name, value)
         check_choice("learner", self.learner, LEARNERS)
         check_choice("layout", self.layout, LAYOUTS)
         check_choice("engine", self.engine, ("auto", "torch", "compiled"))
@@ -86,7 +94,14 @@ class RunConfig:
         check_fraction("epsilon_start", self.epsilon_start)
         check_fraction("epsilon_end", self.epsilon_end)
         check_whole("seed", self.seed, 0)
-        for name in ("total_steps", "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every", "threads"):
+        for name in (
+            "total_steps",
+            "evaluate_every",
+            "evaluation_episodes",
+            "checkpoint_every",
+            "log_every",
+            "threads",
+        ):
             check_whole(name, getattr(self, name))
         check_whole("epsilon_decay_steps", self.epsilon_decay_steps)
         for name, settings in LEARNERS.items():
@@ -99,7 +114,9 @@ class RunConfig:
                     f"use learner={name!r} or leave them out"
                 )
         if self.body is not None and self.layout not in NETWORKS:
-            raise ValueError(f"a {self.layout} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
+            raise ValueError(
+                f"a {self.layout} has no network body; leave body out or choose one of {', '.join(NETWORKS)}"
+            )
         if self.engine == "compiled" and (self.layout not in NETWORKS or isinstance(self.body, Conv)):
             raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
 
@@ -127,7 +144,7 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     """The configuration that `config_to_dict` wrote.
 
     Raises:
-        ValueError: for keys that this version does not know.
+        ValueError: for keys that this version does not know, values of the wrong kind and contradictions.
 
     Example:
         >>> config_from_dict(config_to_dict(RunConfig(seed=3))) == RunConfig(seed=3)
@@ -137,14 +154,41 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     _refuse_unknown("the configuration", values, RunConfig)
     for name, settings in LEARNERS.items():
         if values.get(name) is not None:
-            _refuse_unknown(name, values[name], settings)
-            values[name] = settings(**values[name])
+            values[name] = settings(**_fitted(name, values[name], settings))
     if values.get("body") is not None:
+        if not isinstance(values["body"], Mapping):
+            raise ValueError(f"body must be a mapping with a class, got {values['body']!r}")
         body = dict(values["body"])
-        kind = {"MLP": MLP, "Conv": Conv}[body.pop("class")]
-        _refuse_unknown("body", body, kind)
-        values["body"] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in body.items()})
+        check_choice("class of the body", body.get("class"), BODIES)
+        kind = BODIES[body.pop("class")]
+        values["body"] = kind(**_fitted("body", body, kind))
     return RunConfig(**values)
+
+
+def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:
+    """``given`` with every value of the kind that its field has in the dataclass ``known``."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{place} must be a mapping, got {given!r}")
+    _refuse_unknown(place, given, known)
+    hints = get_type_hints(known)
+    return {name: _fit(f"{place}.{name}".lstrip("."), value, hints[name]) for name, value in given.items()}
+
+
+def _fit(name: str, value: Any, hint: Any) -> Any:
+    kinds = [get_origin(kind) or kind for kind in (get_args(hint) if isinstance(hint, UnionType) else (hint,))]
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    for kind in kinds:
+        if kind is float and is_number:
+            return float(value)
+        if kind is int and is_number and float(value).is_integer():
+            return int(value)
+        if kind is tuple and isinstance(value, list | tuple):
+            return tuple(_fit(f"{name}[{i}]", entry, get_args(hint)[0]) for i, entry in enumerate(value))
+        if kind not in (int, float, tuple) and isinstance(value, kind):
+            return value
+    words = [_WORDS.get(kind, f"a {kind.__name__}") for kind in kinds if kind is not NoneType]
+    words = ["a list" if word == "a tuple" else word for word in words]
+    raise ValueError(f"{name} must be {' or '.join(words)}, got {value!r}")
 
 
 def _refuse_unknown(where: str, given: Mapping[str, Any], known: type) -> None:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["PRESETS", "preset_for"]
+from neuralq.recipes.config import NETWORKS, RunConfig, config_from_dict
+
+__all__ = ["PRESETS", "preset_for", "with_preset"]
 
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
-    # PQN (Gallici et al., 2024) scaled down: many short rollouts with several epochs each, λ near 1, rewards scaled so
-    # that values stay within tens.
+    # PQN (Gallici et al., 2024) scaled down. What matters, found on seeds 100 to 107 (docs/performance.md): many epochs
+    # at a small learning rate, λ near 1, no target network, and rewards scaled so that values stay within tens.
     ("CartPole-v1", "rollout"): {
         "reward_scale": 0.1,
         "epsilon_decay_steps": 20_000,
         "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
-        "rollout": {"lambda_": 0.9, "learning_rate": 1e-3, "num_envs": 32, "num_steps": 32},
+        "rollout": {"lambda_": 0.95, "learning_rate": 5e-4, "num_envs": 32, "num_steps": 32, "num_epochs": 16},
     },
 }
 
@@ -28,3 +31,25 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
         {}
     """
     return PRESETS.get((env, learner), {})
+
+
+def with_preset(plain: Mapping[str, Any]) -> RunConfig:
+    """The configuration of what is given, over the preset of its environment and learner, over the defaults.
+
+    Args:
+        plain: as `config_to_dict` writes it, or any part of that; settings of the learner may be partial too.
+
+    Raises:
+        ValueError: for unknown keys and values out of range, as `RunConfig` does.
+
+    Example:
+        >>> config = with_preset({"env": "CartPole-v1", "rollout": {"num_envs": 8}})
+        >>> config.rollout.num_envs, config.reward_scale
+        (8, 0.1)
+    """
+    learner = plain.get("learner", RunConfig.learner)
+    preset = preset_for(plain.get("env", RunConfig.env), learner)
+    if plain.get("layout", RunConfig.layout) not in NETWORKS:
+        preset = {name: value for name, value in preset.items() if name != "body"}
+    settings = {learner: {**preset.get(learner, {}), **(plain.get(learner) or {})}}
+    return config_from_dict({**preset, **plain, **settings})

@@ -16,13 +16,14 @@ from threadpoolctl import threadpool_limits
 
 from neuralq import checkpoint
 from neuralq.agent import Agent
-from neuralq.evaluation import Evaluation
+from neuralq.checks import check_whole
+from neuralq.evaluation import Evaluation, evaluate_greedy
 from neuralq.features import discrete_actions
 from neuralq.interact import Interaction
 from neuralq.q.flat import FlatParameters
 from neuralq.recipes.build import build_q, build_session, make_envs, plan_of
 from neuralq.recipes.config import RunConfig, config_from_dict, config_to_dict
-from neuralq.record import RunFolder, default_run_path, read_config
+from neuralq.record import RunFolder, default_run_path, read_config, refuse_old_run
 from neuralq.training import Hook, Progress, Session, fit, restore, seed_for
 
 __all__ = ["Run", "evaluate_run", "load", "resume", "train"]
@@ -92,7 +93,9 @@ def train(config: RunConfig, run_dir: str | Path | None = None, hooks: Sequence[
         >>> train(config, run_dir=tempfile.mkdtemp() + "/run").env_steps >= 64
         True
     """
-    path = Path(run_dir) if run_dir is not None else default_run_path(config.env, config.layout, config.seed, datetime.now())
+    default = default_run_path(config.env, config.layout, config.seed, datetime.now())
+    path = default if run_dir is None else Path(run_dir)
+    refuse_old_run(path)  # `RunFolder.create` does too, but building the session takes seconds
     with _threads(config), contextlib.closing(build_session(config)) as session:
         with RunFolder.create(path, config=config_to_dict(config), seed=config.seed) as folder:
             progress = fit(session, plan_of(config), Progress(), folder, hooks)
@@ -102,12 +105,13 @@ def train(config: RunConfig, run_dir: str | Path | None = None, hooks: Sequence[
 def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[Hook] = ()) -> Run:
     """Go on with a run from its newest valid checkpoint, or from the start if it was stopped before the first.
 
-    On a CPU the continued run ends with the same bits as one that was never stopped, where the environment's state can be
-    saved; otherwise every environment starts a new episode.
+    On a CPU the continued run ends with the same bits as one that was never stopped, where the environment's state can
+    be saved; otherwise every environment starts a new episode.
 
     Args:
         run_dir: folder of the run.
-        total_steps: a new budget; a finished run goes on only with a larger one.
+        total_steps: a new budget, which becomes part of the run's configuration; a finished run goes on only with a
+            larger one.
         hooks: called with every row of metrics.
 
     Raises:
@@ -123,6 +127,8 @@ def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[
             saved = checkpoint.load_newest(folder.checkpoints_path)
             progress = restore(session, saved.state, config.seed)
         folder.truncate_metrics(progress.env_steps)
+        if total_steps is not None:
+            folder.replace_config(config_to_dict(config))
         reached = config.stop_at_return is not None and progress.reached_at is not None
         if not (progress.finished and (reached or progress.env_steps >= config.total_steps)):
             progress = fit(session, plan_of(config), progress, folder, hooks)
@@ -175,8 +181,8 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0) ->
         num_episodes: how many episodes.
         seed: of the episodes; unrelated to those seen in training.
     """
-    from neuralq.evaluation import evaluate_greedy
-
+    check_whole("num_episodes", num_episodes)
+    check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
     agent = load(run_dir)
     with _threads(config):

@@ -1,10 +1,4 @@
-"""Experience from vector environments: the one place where episodes end, and the place where they end right.
-
-Gymnasium's vector environments restart finished episodes in one of three ways. NEXT_STEP (the default) inserts a step that
-was never taken; storing it trains across episodes, so lanes that take it are left out. SAME_STEP returns the next
-episode's first observation and hides the true successor in ``info["final_obs"]``, which is read. DISABLED leaves the
-restart to the caller, who asks for it here. Each lane's experience is the same in all three (tests/test_interact.py).
-"""
+"""The stream of experience: one step of a batch of environments after another, as transitions."""
 
 from __future__ import annotations
 
@@ -12,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
@@ -20,20 +13,10 @@ from torch import Tensor
 
 from neuralq.checks import check_discount
 from neuralq.features import Encoder, ObservationError, discrete_actions, encoder_for
+from neuralq.interact.lanes import Lane, LaneFault
 from neuralq.types import Transition
 
-__all__ = [
-    "EnvironmentFault",
-    "Episode",
-    "Interaction",
-    "Lane",
-    "LaneFault",
-    "ObservationSpec",
-    "Policy",
-    "Step",
-    "interact",
-    "make_vector_env",
-]
+__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
 
 _Array = np.ndarray[Any, np.dtype[Any]]
 Policy = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -42,67 +25,6 @@ Policy = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 class EnvironmentFault(RuntimeError):
     """An environment broke its contract; says which one, when and in which field."""
-
-
-class LaneFault(RuntimeError):
-    """An environment raised: carries its index so that a batch can say which."""
-
-    def __init__(self, index: int, cause: BaseException) -> None:
-        super().__init__(f"environment {index} raised {type(cause).__name__}: {cause}")
-        self.index = index
-
-
-class Lane(gym.Wrapper[Any, Any, Any, Any]):
-    """One environment of a batch: its observations are copies, and what it raises names its index.
-
-    Copying matters under SAME_STEP: an environment that reuses its observation array would overwrite the true successor
-    with the next episode's first observation before anybody could read it.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], index: int) -> None:
-        super().__init__(env)
-        self.index = index
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """As the environment's own, with a copied observation."""
-        try:
-            observation, reward, terminated, truncated, info = self.env.step(action)
-        except Exception as error:
-            raise LaneFault(self.index, error) from error
-        return _copied(observation), reward, terminated, truncated, info
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """As the environment's own, with a copied observation."""
-        try:
-            observation, info = self.env.reset(seed=seed, options=options)
-        except Exception as error:
-            raise LaneFault(self.index, error) from error
-        return _copied(observation), info
-
-
-def _copied(observation: Any) -> Any:
-    if isinstance(observation, np.ndarray):
-        return observation.copy()
-    if isinstance(observation, Mapping):
-        return {key: _copied(value) for key, value in observation.items()}
-    if isinstance(observation, tuple):
-        return tuple(_copied(value) for value in observation)
-    return observation
-
-
-def make_vector_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> SyncVectorEnv:
-    """``num_envs`` environments stepped in turn, without autoreset and without copying twice.
-
-    Example:
-        >>> envs = make_vector_env(lambda: gym.make("CartPole-v1"), 2)
-        >>> envs.num_envs
-        2
-    """
-    return SyncVectorEnv(
-        [lambda i=i: Lane(make(), i) for i in range(num_envs)],  # type: ignore[misc]
-        copy=False,
-        autoreset_mode=AutoresetMode.DISABLED,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,16 +80,19 @@ class Interaction:
         ValueError: for spaces that cannot be learned from and environments that do not say how they restart.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], discount: float, seed: int | None, as_index: bool = False) -> None:
+    def __init__(
+        self, envs: VectorEnv[Any, Any, Any], discount: float, seed: int | None, as_index: bool = False
+    ) -> None:
         check_discount("discount", discount)
         self.envs = envs
         self.num_envs: int = envs.num_envs
-        self.discount = np.float32(discount)
+        self.discount = float(discount)
         self.encoder: Encoder = encoder_for(envs.single_observation_space, as_index=as_index)
         self.num_actions, self._first_action = discrete_actions(envs.single_action_space)
         self.mode = _autoreset_mode(envs)
-        if isinstance(envs, SyncVectorEnv):
-            envs.envs = tuple(e if isinstance(e, Lane) else Lane(e, i) for i, e in enumerate(envs.envs))
+        inner = envs.unwrapped
+        if isinstance(inner, SyncVectorEnv):
+            inner.envs = [e if isinstance(e, Lane) else Lane(e, i) for i, e in enumerate(inner.envs)]
         self.num_steps = 0
         self._everyone = np.arange(self.num_envs)
         self._broken = False
@@ -175,55 +100,74 @@ class Interaction:
         self._lengths = np.zeros(self.num_envs, np.int64)
         self._pending = np.zeros(self.num_envs, bool)
         self._mask: _Array | None = None
+        self._begun = False
         self.restart(seed)
+        self._begun = True
         self.spec = self._describe()
 
     def _describe(self) -> ObservationSpec:
-        inner = self.encoder.shape
-        masked = self._mask is not None
-        if not masked:
-            return ObservationSpec(inner, self.encoder.dtype, inner, self.encoder.num_categories, False, self.num_actions)
+        encoder, masked = self.encoder, self._mask is not None
         return ObservationSpec(
-            self._s.shape[1:], self._s.dtype, inner, self.encoder.num_categories, True, self.num_actions
+            self._s.shape[1:], self._s.dtype, encoder.shape, encoder.num_categories, masked, self.num_actions
         )
 
     def restart(self, seed: int | None) -> None:
-        """Reset every environment: an episode boundary in every lane."""
+        """Reset every environment: an episode boundary in every lane.
+
+        Raises:
+            EnvironmentFault: if an environment raises, or hands out what its space did not promise.
+        """
         try:
             observation, info = self.envs.reset(seed=seed)
         except Exception as error:
-            raise EnvironmentFault(f"at reset: {error}") from error
+            raise self._fault(f"at reset, {_describe_error(error)}") from error
         self._pending[:] = False
         self._returns[:] = 0
         self._lengths[:] = 0
-        self._s = self._observe(observation, info)
+        self._s = self._observe(observation, info, self._everyone)
 
-    def _observe(self, observation: Any, info: Mapping[str, Any]) -> _Array:
-        """Encode a batch, with the action mask appended where the environment gives one."""
+    def _observe(self, observation: Any, info: Mapping[str, Any], lanes: _Array, over: _Array | None = None) -> _Array:
+        """Encode a batch, with the action mask of ``lanes`` appended where the environment gives one.
+
+        Where ``over`` is true the world has ended, and there may be no legal action.
+        """
         try:
             encoded = self.encoder.encode(observation)
         except ObservationError as error:
             raise self._fault(str(error)) from error
-        if "action_mask" in info:
-            self._read_mask(info)
-        return encoded if self._mask is None else self._with_mask(encoded)
-
-    def _read_mask(self, info: Mapping[str, Any]) -> None:
-        given = np.asarray(info["action_mask"])
-        if given.dtype == object:  # lanes without one hold None
-            rows = np.flatnonzero(info["_action_mask"])
-            given = np.stack([np.asarray(given[i]) for i in rows]) if len(rows) else given[:0]
-        else:
-            rows = np.flatnonzero(info.get("_action_mask", np.ones(self.num_envs, bool)))
-            given = given[rows]
-        if len(rows) and given.shape[1:] != (self.num_actions,):
-            raise self._fault(f"info['action_mask'] must have {self.num_actions} entries, got {given.shape[1:]}")
-        if self._mask is None:
+        if self._mask is None and "action_mask" in info:
+            if self._begun:
+                raise self._fault("field info['action_mask']: given now but not at the first reset; give it always")
             self._mask = np.ones((self.num_envs, self.num_actions), bool)
-        self._mask[rows] = given != 0
-        if not self._mask.any(-1).all():
-            # A finished episode may show a state without actions; the world has ended there.
-            self._mask[~self._mask.any(-1)] = True
+        if self._mask is None:
+            return encoded
+        self._mask[lanes] = self._legal(info, lanes, over)
+        return self._with_mask(encoded)
+
+    def _legal(self, info: Mapping[str, Any], lanes: _Array, over: _Array | None) -> _Array:
+        """The masks of ``lanes``, ``[k, A]`` bool; a lane without one may do everything."""
+        legal = np.ones((len(lanes), self.num_actions), bool)
+        given, held = info.get("action_mask"), info.get("_action_mask")
+        if given is None:
+            return legal
+        rows = np.flatnonzero(np.ones(len(lanes)) if held is None else held[lanes])
+        found = np.asarray(given)[lanes[rows]]
+        masks = found if found.dtype != object else [np.asarray(mask) for mask in found]
+        shapes = [found.shape[1:]] if found.dtype != object else [mask.shape for mask in masks]
+        for row, shape in zip(rows, shapes, strict=False):
+            if shape != (self.num_actions,):
+                raise self._mask_fault(lanes[row], f"must have {self.num_actions} entries, got shape {shape}")
+        if len(rows):
+            legal[rows] = np.asarray(masks) != 0
+        for row in np.flatnonzero(~legal.any(-1)):
+            if over is None or not over[lanes[row]]:
+                raise self._mask_fault(lanes[row], "must allow an action until the episode has terminated, allows none")
+            legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
+        return legal
+
+    def _mask_fault(self, lane: int, problem: str) -> EnvironmentFault:
+        step = self._lengths[lane] + 1
+        return self._fault(f"environment {lane}, step {step} of its episode, field info['action_mask']: {problem}")
 
     def _with_mask(self, encoded: _Array) -> _Array:
         assert self._mask is not None
@@ -256,12 +200,13 @@ class Interaction:
             raise self._fault(_describe_error(error)) from error
         last = terminated | truncated
         r_t = self._checked_reward(reward)
-        arrived = self._observe(observation, info)
-        s_t = self._true_successors(arrived, last, info) if self.mode is AutoresetMode.SAME_STEP else arrived
+        same_step = self.mode is AutoresetMode.SAME_STEP
+        arrived = self._observe(observation, info, self._everyone, None if same_step else terminated)
+        s_t = self._true_successors(arrived, last, terminated, info) if same_step and last.any() else arrived
         fake = self._pending
         everyone = not fake.any()
         lanes = self._everyone if everyone else np.flatnonzero(~fake)
-        discount_t = np.where(terminated, np.float32(0), self.discount)
+        discount_t = np.where(terminated, 0.0, self.discount)
         rows = [self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last]
         if not everyone:
             rows = [row[lanes] for row in rows]
@@ -278,7 +223,10 @@ class Interaction:
         return Step(transition, lanes, episodes)
 
     def _checked_reward(self, reward: Any) -> _Array:
-        r_t = np.asarray(reward, np.float32)
+        try:
+            r_t = np.array(reward, np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._fault(f"field reward: must be numbers, got {reward!r}") from error
         if r_t.shape != (self.num_envs,):
             raise self._fault(f"field reward: must have shape ({self.num_envs},), got {r_t.shape}")
         if not np.isfinite(r_t).all():
@@ -289,24 +237,19 @@ class Interaction:
             )
         return r_t
 
-    def _true_successors(self, arrived: _Array, last: _Array, info: Mapping[str, Any]) -> _Array:
-        if not last.any():
-            return arrived
+    def _true_successors(self, arrived: _Array, last: _Array, terminated: _Array, info: Mapping[str, Any]) -> _Array:
+        """Under SAME_STEP, what the finished episodes really arrived at."""
         successors = arrived.copy()
-        final, final_info = info["final_obs"], info.get("final_info", {})
-        width = self.num_actions
-        for lane in np.flatnonzero(last):
+        rows = successors.reshape(self.num_envs, -1)  # a view
+        ended = np.flatnonzero(last)
+        for lane in ended:
             try:
-                encoded = self.encoder.encode_single(final[lane], lane=int(lane))
+                encoded = self.encoder.encode_single(info["final_obs"][lane], lane=int(lane))
             except ObservationError as error:
                 raise self._fault(str(error)) from error
-            if self._mask is None:
-                successors[lane] = encoded
-                continue
-            successors[lane, :-width] = np.reshape(encoded, -1)
-            mask = final_info.get("action_mask")
-            legal = np.ones(width) if mask is None or mask[lane] is None else np.asarray(mask[lane]) != 0
-            successors[lane, -width:] = legal if legal.any() else 1
+            rows[lane, : encoded.size] = np.reshape(encoded, -1)
+        if self._mask is not None:
+            successors[ended, -self.num_actions :] = self._legal(info.get("final_info", {}), ended, terminated)
         return successors
 
     def _finish(self, last: _Array, arrived: _Array) -> tuple[Episode, ...]:
@@ -320,7 +263,7 @@ class Interaction:
                 observation, info = self.envs.reset(options={"reset_mask": last})
             except Exception as error:
                 raise self._fault(_describe_error(error)) from error
-            fresh = self._observe(observation, info)
+            fresh = self._observe(observation, info, ended)
             self._s = arrived.copy()
             self._s[ended] = fresh[ended]
         return episodes
@@ -351,7 +294,9 @@ class Interaction:
 
 
 def _describe_error(error: Exception) -> str:
-    return str(error) if isinstance(error, LaneFault) else f"an environment raised {type(error).__name__}: {error}"
+    if isinstance(error, LaneFault | ObservationError):
+        return str(error)
+    return f"an environment raised {type(error).__name__}: {error}"
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any]) -> AutoresetMode:
@@ -382,7 +327,8 @@ def interact(
         Transitions ``[k]``, one row for each environment that moved: all N, fewer while one restarts.
 
     Example:
-        >>> envs = make_vector_env(lambda: gym.make("CartPole-v1"), 2)
+        >>> import gymnasium as gym
+        >>> envs = gym.make_vec("CartPole-v1", num_envs=2)
         >>> push_left = lambda s, rng: (torch.zeros(len(s), dtype=torch.int64), torch.ones(len(s)))
         >>> next(interact(envs, push_left, np.random.default_rng(0))).r_t.tolist()
         [1.0, 1.0]

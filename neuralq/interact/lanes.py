@@ -1,0 +1,105 @@
+"""The environments of a batch, each knowing its place in it: what goes wrong in one of them is told with its index."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from neuralq.checks import check_whole
+from neuralq.features import encoder_for
+
+__all__ = ["Lane", "LaneFault", "make_vector_env"]
+
+
+class LaneFault(RuntimeError):
+    """An environment raised: carries its index so that a batch can say which."""
+
+    def __init__(self, index: int, problem: str) -> None:
+        super().__init__(f"environment {index}{problem}")
+        self.index = index
+
+
+class Lane(gym.Wrapper[Any, Any, Any, Any]):
+    """One environment of a batch: its observations are copies of the promised kind, and what it raises names its index.
+
+    Copying matters under SAME_STEP: an environment that reuses its observation array would overwrite the true successor
+    with the next episode's first observation before anybody could read it. Checking matters because a batch casts what
+    it is given to the space's dtype without a word, and says nothing of the index where the shape is wrong.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], index: int) -> None:
+        super().__init__(env)
+        self.index = index
+        space = env.observation_space
+        self._encoder = encoder_for(space)
+        self._shape = space.shape if isinstance(space, spaces.Box) else None
+        self._dtype = space.dtype
+        self._whole = isinstance(space, spaces.Discrete)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As the environment's own, with a copied observation and the reward as a float."""
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        except Exception as error:
+            raise self._raised(error) from error
+        try:
+            r_t = float(reward)
+        except Exception as error:
+            raise LaneFault(self.index, f": reward must be a number, got {reward!r}") from error
+        return self._checked(observation), r_t, terminated, truncated, info
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """As the environment's own, with a copied observation."""
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            raise self._raised(error) from error
+        return self._checked(observation), info
+
+    def _raised(self, error: Exception) -> LaneFault:
+        return LaneFault(self.index, f" raised {type(error).__name__}: {error}")
+
+    def _checked(self, observation: Any) -> Any:
+        """A copy; the quick way first, for arrays and numbers of exactly the promised kind."""
+        if type(observation) is np.ndarray and self._shape is not None:
+            if observation.dtype != self._dtype or observation.shape != self._shape:
+                self._encoder.encode_single(observation, lane=self.index)
+                self._dtype = observation.dtype
+            return observation.copy()
+        if not (self._whole and type(observation) in (int, np.int64)):
+            self._encoder.encode_single(observation, lane=self.index)
+        return _copied(observation)
+
+
+def _copied(observation: Any) -> Any:
+    if isinstance(observation, np.ndarray):
+        return observation.copy()
+    if isinstance(observation, Mapping):
+        return {key: _copied(value) for key, value in observation.items()}
+    if isinstance(observation, tuple):
+        return tuple(_copied(value) for value in observation)
+    return observation
+
+
+def make_vector_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> SyncVectorEnv:
+    """``num_envs`` environments stepped in turn, without autoreset and without copying twice.
+
+    Example:
+        >>> envs = make_vector_env(lambda: gym.make("CartPole-v1"), 2)
+        >>> envs.num_envs
+        2
+    """
+    check_whole("num_envs", num_envs)
+    return SyncVectorEnv(
+        [partial(_lane, make, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
+    )
+
+
+def _lane(make: Callable[[], gym.Env[Any, Any]], index: int) -> Lane:
+    return Lane(make(), index)

@@ -1,0 +1,265 @@
+"""Feeds: what reaches the learner, when, and with which weight.
+
+Mutants that these tests kill: an idle lane that carries a λ-return across its pause; rows of the last rollout that show
+through; a sample drawn one step early or late; a period that is forgotten when several lanes step at once; priorities
+given to the wrong steps; a rollout saved half collected.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torch import Tensor
+
+from neuralq.feed import OnlineFeed, ReplayFeed, RolloutFeed, Sample
+from neuralq.interact import Interaction, Step
+from neuralq.learners import OnlineLearner, OnlineSettings, RolloutLearner, RolloutSettings
+from neuralq.q import TableQ
+from neuralq.q.engine import Loss, TorchEngine
+from neuralq.replay import Prioritised, ReplayBuffer
+from neuralq.types import Transition
+
+LENGTHS = (3, 1, 4, 2)
+GAMMA, N, T = 0.9, 3, 12
+
+
+class Corridor(gym.Env[Any, Any]):
+    """Episodes of scripted lengths; every other one is cut off by a time limit. States never repeat within a lane."""
+
+    def __init__(self, lane: int) -> None:
+        self.observation_space = spaces.Discrete(1000)
+        self.action_space = spaces.Discrete(2)
+        self.lane, self.episode, self.t, self.clock = lane, lane, 0, 0
+
+    def _state(self) -> int:
+        return 300 * self.lane + self.clock
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
+        self.episode, self.t, self.clock = self.episode + 1, 0, self.clock + 1
+        return self._state(), {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        self.t, self.clock = self.t + 1, self.clock + 1
+        ends, cut_off = self.t == LENGTHS[self.episode % 4], self.episode % 2 == 0
+        return self._state(), float(np.sin(self.clock + self.lane)) + action, ends and not cut_off, ends and cut_off, {}
+
+
+def stream_of(mode: AutoresetMode, num_lanes: int = N) -> Interaction:
+    envs = SyncVectorEnv([lambda i=i: Corridor(i) for i in range(num_lanes)], autoreset_mode=mode)
+    return Interaction(envs, GAMMA, seed=0, as_index=True)
+
+
+def act(s: Tensor) -> tuple[Tensor, Tensor]:
+    return s % 2, torch.full((len(s),), 0.5)
+
+
+def learner_of(returns: str) -> RolloutLearner:
+    engine = TorchEngine(TableQ(1000, 2), Loss())
+    engine.flat.values.copy_(torch.from_numpy(np.random.default_rng(0).normal(size=2000)))
+    settings = RolloutSettings(lambda_=0.8, returns=returns, num_envs=N, num_steps=T, optimiser="sgd", num_epochs=1)
+    return RolloutLearner(engine, settings, np.random.default_rng(0))
+
+
+def rollout_of(stream: Interaction, feed: RolloutFeed) -> Sample:
+    while True:
+        feed.add(stream.step(act))
+        for sample in feed.draw():
+            return sample
+
+
+@pytest.mark.parametrize("returns", ["peng", "watkins"])
+def test_returns_of_real_rows_are_those_of_a_stream_without_pauses(returns: str) -> None:
+    learner = learner_of(returns)
+    paused, plain = stream_of(AutoresetMode.NEXT_STEP), Lanes(stream_of(AutoresetMode.DISABLED))
+    feed = RolloutFeed(T, N, paused.spec)
+    for _ in range(3):  # later rollouts are written over earlier ones
+        sample = rollout_of(paused, feed)
+        assert sample.weight is not None
+        held = sample.weight > 0
+        assert 0 < int((~held).sum()) < T * N
+        targets = learner.targets(sample.transition)
+        for lane in range(N):
+            rows = held[:, lane]
+            lane_only = sample.transition.map(lambda x, lane=lane, rows=rows: x[rows][:, lane : lane + 1])
+            wanted = plain.take(lane, int(rows.sum()))
+            for ours, theirs in zip(_fields(lane_only), _fields(wanted), strict=True):
+                assert torch.equal(ours, theirs)
+            torch.testing.assert_close(targets[rows, lane], learner.targets(wanted)[:, 0], rtol=0, atol=1e-12)
+
+
+class Lanes:
+    """Each lane's steps of a stream that never pauses, as many as are asked for."""
+
+    def __init__(self, plain: Interaction) -> None:
+        self.plain = plain
+        self.waiting: list[list[Transition]] = [[] for _ in range(N)]
+
+    def take(self, lane: int, count: int) -> Transition:
+        """The next ``count`` steps of one lane, ``[count, 1]``."""
+        while len(self.waiting[lane]) < count:
+            step = self.plain.step(act)
+            for i, queue in enumerate(self.waiting):
+                queue.append(step.transition.map(lambda x, i=i: x[i : i + 1]))
+        taken, self.waiting[lane] = self.waiting[lane][:count], self.waiting[lane][count:]
+        return Transition(*(torch.stack(list(field)) for field in zip(*map(_fields, taken), strict=True)))
+
+
+def _fields(t: Transition) -> tuple[Tensor, ...]:
+    return t.s_tm1, t.a_tm1, t.mu_tm1, t.r_t, t.discount_t, t.s_t, t.last_t
+
+
+def test_rows_without_experience_have_weight_zero_and_break_the_stream() -> None:
+    stream = stream_of(AutoresetMode.NEXT_STEP)
+    feed = RolloutFeed(T, N, stream.spec)
+    moved = np.zeros((T, N))
+    for row in range(T):
+        assert feed.between_samples == (row == 0)
+        step = stream.step(act)
+        feed.add(step)
+        moved[row, step.lanes] = 1
+        if row < T - 1:
+            assert list(feed.draw()) == []
+            with pytest.raises(ValueError, match=rf"half collected \({row + 1} of {T} rows\)"):
+                feed.state_dict()
+    (sample,) = feed.draw()
+    assert sample.weight is not None
+    np.testing.assert_array_equal(sample.weight.numpy(), moved)
+    idle = sample.weight == 0
+    assert sample.transition.last_t[idle].all() and not sample.transition.discount_t[idle].any()
+    assert list(feed.draw()) == [] and feed.between_samples and feed.state_dict() == {}
+
+
+def test_a_full_rollout_has_no_weights_and_keeps_double_precision() -> None:
+    stream = stream_of(AutoresetMode.DISABLED)
+    sample = rollout_of(stream, RolloutFeed(T, N, stream.spec))
+    assert sample.weight is None
+    assert sample.transition.r_t.dtype == sample.transition.discount_t.dtype == torch.float64
+    assert set(sample.transition.discount_t.unique().tolist()) == {0.0, GAMMA}
+
+
+def steps_of(num_lanes: int, count: int) -> list[Step]:
+    stream = stream_of(AutoresetMode.DISABLED, num_lanes)
+    return [stream.step(act) for _ in range(count)]
+
+
+def replay_feed(num_lanes: int, *cadence: int, block_length: int = 1, prioritised: bool = False) -> ReplayFeed:
+    settings = Prioritised(alpha=1.0, epsilon=1e-12) if prioritised else None
+    buffer = ReplayBuffer(300, (), np.int64, num_lanes=num_lanes, prioritised=settings)
+    return ReplayFeed(buffer, np.random.default_rng(0), 8, block_length, *cadence)
+
+
+@pytest.mark.parametrize(
+    ("num_lanes", "cadence", "wanted"),
+    [
+        (1, (4, 1, 1), [0, 0, 0, 1, 1, 1, 1, 1]),
+        (1, (4, 3, 2), [0, 0, 0, 2, 0, 0, 2, 0]),
+        (3, (4, 1, 1), [0, 3, 3, 3]),  # six steps stored when the fourth was due: the fifth and sixth are made up for
+        (3, (4, 4, 1), [0, 1, 1, 1, 0, 1]),  # due at 4, 8, 12, 16; stored 3, 6, 9, 12, 15, 18
+        (3, (1, 2, 1), [2, 1, 2, 1]),  # due at 1, 3 | 5 | 7, 9 | 11
+        (2, (2, 5, 3), [3, 0, 0, 3, 0, 3]),  # due at 2, 7, 12
+    ],
+)
+def test_samples_come_when_they_are_due(num_lanes: int, cadence: tuple[int, ...], wanted: list[int]) -> None:
+    feed = replay_feed(num_lanes, *cadence)
+    got = []
+    for step in steps_of(num_lanes, len(wanted)):
+        feed.add(step)
+        got.append(sum(1 for _ in feed.draw()))
+        assert feed.between_samples
+    assert got == wanted
+    assert len(feed.buffer) == num_lanes * len(wanted)
+
+
+def test_what_is_drawn_is_what_was_added() -> None:
+    feed = replay_feed(3, 1, 1, 1)
+    added: dict[int, tuple[float, ...]] = {}
+    for step in steps_of(3, 20):
+        feed.add(step)
+        added |= {int(row[0]): tuple(map(float, row)) for row in zip(*_fields(step.transition), strict=True)}
+        for sample in feed.draw():
+            assert sample.weight is None and sample.indices is None
+            for row in zip(*_fields(sample.transition), strict=True):
+                assert tuple(map(float, row)) == pytest.approx(added[int(row[0])], rel=1e-6)
+
+
+def test_blocks_are_consecutive_steps_of_one_lane() -> None:
+    feed = replay_feed(3, 12, 3, 1, block_length=4)
+    seen = 0
+    for step in steps_of(3, 30):
+        feed.add(step)
+        for sample in feed.draw():
+            t, seen = sample.transition, seen + 1
+            assert t.r_t.shape == (4, 2)
+            goes_on = ~t.last_t[:-1]
+            assert torch.equal(t.s_tm1[1:][goes_on], t.s_t[:-1][goes_on])
+            assert bool((t.s_tm1[1:] > t.s_tm1[:-1]).all()) and bool((t.s_tm1 // 300 == t.s_tm1[0] // 300).all())
+    assert seen == 27
+
+
+def test_errors_come_back_as_the_priorities_of_the_steps_they_belong_to() -> None:
+    feed = replay_feed(1, 5, 100, 1, prioritised=True)
+    for step in steps_of(1, 5):
+        feed.add(step)
+    (sample,) = feed.draw()
+    assert sample.weight is not None and sample.indices is not None
+    # Only the step at index 2 was surprising; from now on it is what is drawn.
+    feed.buffer.update_priorities(np.arange(5), np.full(5, 1e-12))
+    feed.return_errors(Sample(sample.transition, sample.weight, np.array([2, 4])), torch.tensor([-7.0, 1e-12]))
+    assert set(feed.buffer.sample(32, np.random.default_rng(0)).indices.tolist()) == {2}
+
+
+def test_a_restored_replay_feed_draws_the_same() -> None:
+    steps = steps_of(2, 12)
+    one, two = replay_feed(2, 3, 3, 1, prioritised=True), replay_feed(2, 3, 3, 1, prioritised=True)
+    for step in steps[:7]:
+        one.add(step)
+        for sample in one.draw():
+            one.return_errors(sample, sample.transition.r_t)
+    two.load_state_dict(one.state_dict())
+    two._rng.bit_generator.state = one._rng.bit_generator.state
+    for step in steps[7:]:
+        one.add(step)
+        two.add(step)
+        for ours, theirs in zip(one.draw(), two.draw(), strict=True):
+            for x, y in zip(_fields(ours.transition), _fields(theirs.transition), strict=True):
+                assert torch.equal(x, y)
+
+
+def test_the_online_feed_passes_every_step_once_with_pauses_left_out() -> None:
+    stream = stream_of(AutoresetMode.NEXT_STEP)
+    feed = OnlineFeed(N, stream.spec)
+    pauses = 0
+    for _ in range(20):
+        step = stream.step(act)
+        feed.add(step)
+        assert not feed.between_samples
+        (sample,) = feed.draw()
+        assert feed.between_samples and list(feed.draw()) == []
+        weight = torch.ones(N) if sample.weight is None else sample.weight
+        assert torch.nonzero(weight)[:, 0].tolist() == step.lanes.tolist()
+        pauses += N - len(step.lanes)
+        for ours, theirs in zip(_fields(sample.transition), _fields(step.transition), strict=True):
+            assert torch.equal(ours[weight > 0], theirs)
+    assert pauses > 5
+
+
+def test_traces_learn_the_same_with_and_without_pauses() -> None:
+    # Each lane alone, so that the order of updates is the same in both modes.
+    weights = []
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+        stream = stream_of(mode, 1)
+        learner = OnlineLearner(TorchEngine(TableQ(1000, 2), Loss()), OnlineSettings(step_size=0.5))
+        feed = OnlineFeed(1, stream.spec)
+        while stream.num_steps < 40:
+            feed.add(stream.step(act))
+            for sample in feed.draw():
+                learner.update(sample.transition, sample.weight)
+        weights.append(learner.engine.flat.values.clone())
+    assert torch.equal(*weights)
+    assert bool(weights[0].any())
