@@ -6,10 +6,11 @@ Every seed trains with the preset on one thread, and is evaluated greedily (20 e
 solved at its first evaluation that averages at least 475; training goes on, and "stays" says whether the next three
 evaluations average that too. CPU-seconds are those of training: evaluating and compiling are not counted. Example:
 
-    seed   steps   CPU-s   next three
-       0   25,366    0.49  500 500 500  stays
+    seed     steps   CPU-s   next three
+       0    13,048    0.66   378 362 499  falls below
+       1    17,144    0.86   500 500 500  stays
        …
-    10 of 10 seeds within 100,000 steps; median 25,366 steps, 0.52 CPU-seconds; 9 of 10 stay above 475
+    10 of 10 seeds within 100,000 steps; median 15,098 steps, 0.75 CPU-seconds; 3 of 10 stay above 475
 
 ``--json`` prints one JSON object as the last line, with the same numbers.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import gymnasium as gym
@@ -50,20 +51,21 @@ def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
     Raises:
         ValueError: if the environment is not registered or cannot be made, with what to do about it.
     """
+    module, _, env_id = config.env.rpartition(":")
     try:
-        spec = gym.spec(config.env)
+        if module:  # registers the environment
+            importlib.import_module(module)
+        spec = gym.spec(env_id)
         if num_envs > 1 and spec.vector_entry_point is not None:
-            return gym.make_vec(
-                config.env, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs
-            )
-        return make_vector_env(lambda: gym.make(config.env, **config.env_kwargs), num_envs)
+            return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
+        return make_vector_env(lambda: gym.make(env_id, **config.env_kwargs), num_envs)
     except gym.error.Error as error:
         raise ValueError(
-            f"cannot make the environment {config.env!r}: {error}. Name a registered Gymnasium id; an environment of "
-            "your own is found as 'your_module:YourEnv-v0'"
+            f"cannot make the environment {config.env!r}: {str(error).rstrip('.')}. Name a registered Gymnasium id; an "
+            "environment of your own is found as 'your_module:YourEnv-v0'"
         ) from error
-    except ModuleNotFoundError as error:
-        raise ValueError(f"cannot make the environment {config.env!r}: {error}") from error
+    except Exception as error:  # the environment's own code ran
+        raise ValueError(f"cannot make the environment {config.env!r}: {type(error).__name__}: {error}") from error
 
 
 def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:

@@ -1,4 +1,4 @@
-"""Settings that are known to work, by environment and learner. A preset gives defaults; whatever is set explicitly wins."""
+"""Settings known to work, by environment and learner. A preset gives defaults; whatever is set explicitly wins."""
 
 from __future__ import annotations
 
