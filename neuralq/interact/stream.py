@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,8 +19,14 @@ from neuralq.types import Transition
 __all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
 
 _Array = np.ndarray[Any, np.dtype[Any]]
-Policy = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``."""
+
+
+class Policy(Protocol):
+    """Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``."""
+
+    def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Actions and their probabilities."""
+        ...
 
 
 class EnvironmentFault(RuntimeError):

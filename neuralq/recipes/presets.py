@@ -18,6 +18,25 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
         "rollout": {"lambda_": 0.95, "learning_rate": 5e-4, "num_envs": 32, "num_steps": 32, "num_epochs": 16},
     },
+    # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
+    # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
+    ("neuralq/MitchellGrid-v0", "rollout"): {
+        "total_steps": 16_000,
+        "gamma": 0.9,
+        "reward_scale": 0.01,
+        "epsilon_start": 1.0,
+        "epsilon_end": 1.0,
+        "evaluate_every": 16_000,
+        "rollout": {
+            "lambda_": 0.0,
+            "num_envs": 16,
+            "num_steps": 8,
+            "num_epochs": 8,
+            "num_minibatches": 1,
+            "optimiser": "sgd",
+            "learning_rate": 0.5,
+        },
+    },
 }
 
 
