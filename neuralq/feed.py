@@ -89,21 +89,18 @@ class _Rows:
         self.transition = Transition(*(torch.from_numpy(x) for x in self.fields))
 
     def write(self, row: int, step: Step) -> None:
-        t = step.transition
-        values = (t.s_tm1, t.a_tm1, t.mu_tm1, t.r_t, t.discount_t, t.s_t, t.last_t)
         if len(step.lanes) == self.held.shape[1]:
-            for field, value in zip(self.fields, values, strict=True):
-                field[row] = value.numpy()
+            for field, value in zip(self.fields, step.rows, strict=True):
+                field[row] = value
             self.held[row] = 1
             return
-        for field, value in zip(self.fields, values, strict=True):
-            field[row, step.lanes] = value.numpy()
         # A lane that did not move: nothing may reach across it, and nobody may learn from it.
-        idle = np.setdiff1d(np.arange(self.held.shape[1]), step.lanes)
-        self.fields[4][row, idle] = 0
-        self.fields[6][row, idle] = True
-        self.held[row] = 1
-        self.held[row, idle] = 0
+        self.fields[4][row] = 0
+        self.fields[6][row] = True
+        self.held[row] = 0
+        for field, value in zip(self.fields, step.rows, strict=True):
+            field[row, step.lanes] = value
+        self.held[row, step.lanes] = 1
 
 
 class RolloutFeed:
@@ -187,14 +184,11 @@ class ReplayFeed:
 
     def add(self, step: Step) -> None:
         """Store one step of each lane that moved."""
-        t = step.transition
         if len(step.lanes) == 1:
-            self.buffer.add_step(
-                int(step.lanes[0]), t.s_tm1[0].numpy(), int(t.a_tm1), float(t.mu_tm1), float(t.r_t),
-                float(t.discount_t), t.s_t[0].numpy(), bool(t.last_t),
-            )  # fmt: skip
+            s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t = (row[0] for row in step.rows)
+            self.buffer.add_step(int(step.lanes[0]), s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t)
         else:
-            self.buffer.add(t, step.lanes)
+            self.buffer.add(step.transition, step.lanes)
         self._num_added += len(step.lanes)
 
     def draw(self) -> Iterator[Sample]:

@@ -188,7 +188,7 @@ def test_replay_contents_are_the_same_in_all_modes(options: dict[str, Any]) -> N
             keep = left[step.lanes] > 0
             left[step.lanes[keep]] -= 1
             if keep.any():
-                feed.add(Step(step.transition.map(lambda x, k=keep: x[k]), step.lanes[keep], ()))
+                feed.add(Step(tuple(row[keep] for row in step.rows), step.lanes[keep], ()))
         assert buffer.num_breaks == 0
         contents.append(flattened(buffer.state_dict()))
         sampled = buffer.sample(64, np.random.default_rng(1)).transition

@@ -65,11 +65,23 @@ class Episode:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of a batch of environments: ``transition`` has one row for each lane in ``lanes`` that really moved."""
+    """One step of a batch of environments, with one row for each lane that really moved.
 
-    transition: Transition
+    Args:
+        rows: the fields of the `Transition`, in its order, as arrays ``[k, …]``. Feeds copy them; making tensors first
+            would cost as much again as the copying.
+        lanes: which lane each row is, ``[k]``.
+        episodes: those that ended with this step.
+    """
+
+    rows: tuple[_Array, ...]
     lanes: _Array
     episodes: tuple[Episode, ...]
+
+    @property
+    def transition(self) -> Transition:
+        """The same as tensors, sharing the memory of ``rows``."""
+        return Transition(*(torch.from_numpy(row) for row in self.rows))
 
 
 class Interaction:
@@ -213,11 +225,10 @@ class Interaction:
         everyone = not fake.any()
         lanes = self._everyone if everyone else np.flatnonzero(~fake)
         discount_t = np.where(terminated, 0.0, self.discount)
-        rows = [self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last]
+        rows = (self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last)
         if not everyone:
-            rows = [row[lanes] for row in rows]
+            rows = tuple(row[lanes] for row in rows)
             r_t = np.where(fake, 0, r_t)
-        transition = Transition(*(torch.from_numpy(row) for row in rows))
         self.num_steps += len(lanes)
         self._returns += r_t
         self._lengths[lanes] += 1
@@ -226,7 +237,7 @@ class Interaction:
             self._pending = last
         if not (self.mode is AutoresetMode.DISABLED and episodes):
             self._s = arrived
-        return Step(transition, lanes, episodes)
+        return Step(rows, lanes, episodes)
 
     def _checked_reward(self, reward: Any) -> _Array:
         try:

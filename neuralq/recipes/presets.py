@@ -18,6 +18,12 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
         "rollout": {"lambda_": 0.95, "learning_rate": 5e-4, "num_envs": 32, "num_steps": 32, "num_epochs": 16},
     },
+    # Plain gradient steps without replay or step bounds need small values and normalised layers to stay finite.
+    ("CartPole-v1", "online"): {
+        "reward_scale": 0.1,
+        "body": {"class": "MLP", "hidden": [64, 64], "layer_norm": True},
+        "online": {"lambda_": 0.8, "step_size": 1e-3},
+    },
     # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
     # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
     ("neuralq/MitchellGrid-v0", "rollout"): {
