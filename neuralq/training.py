@@ -10,10 +10,10 @@ import contextlib
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -31,8 +31,13 @@ from neuralq.types import Transition
 
 __all__ = ["Diverged", "Hook", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
 
-Hook = Callable[[Mapping[str, Any]], None]
-"""Called with every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
+
+class Hook(Protocol):
+    """Takes every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
+
+    def __call__(self, row: Mapping[str, Any], /) -> None:
+        """Take in one row."""
+        ...
 
 
 class Diverged(RuntimeError):

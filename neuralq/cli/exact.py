@@ -66,8 +66,8 @@ def _json_object(text: str) -> dict[str, Any]:
 def _model(env_id: str, kwargs: dict[str, Any]) -> FiniteMDP:
     try:
         env = gym.make(env_id, **kwargs)
-    except (gym.error.Error, ModuleNotFoundError) as error:
-        raise ValueError(f"cannot make the environment {env_id!r}: {error}") from error
+    except Exception as error:  # the environment's own code ran
+        raise ValueError(f"cannot make the environment {env_id!r}: {type(error).__name__}: {error}") from error
     try:
         own = getattr(env.unwrapped, "mdp", None)
         return own() if callable(own) else FiniteMDP.from_gymnasium(env)

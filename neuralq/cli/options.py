@@ -122,7 +122,7 @@ def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list
     file = {} if known.config is None else _read_file(known.config)
     for name, default in (("env", ""), ("learner", RunConfig.learner), ("layout", RunConfig.layout)):
         setattr(known, name, getattr(known, name) or file.get(name) or default)
-    if known.learner not in LEARNERS:  # refused with the right words later
+    if str(known.learner) not in LEARNERS:  # refused with the right words later
         known.learner = RunConfig.learner
     return known, file, rest
 
@@ -218,7 +218,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     """
     argv = _with_env_named(hyphenated(argv))
     known, file, rest = _peek(argv)
-    preset = preset_for(known.env, known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
+    preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
     if known.layout not in NETWORKS:  # a preset's body is for networks
         preset = {name: value for name, value in preset.items() if name != "body"}
     if {"-h", "--help"} & set(rest):

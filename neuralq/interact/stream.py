@@ -225,7 +225,7 @@ class Interaction:
         everyone = not fake.any()
         lanes = self._everyone if everyone else np.flatnonzero(~fake)
         discount_t = np.where(terminated, 0.0, self.discount)
-        rows = (self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last)
+        rows: tuple[_Array, ...] = (self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last)
         if not everyone:
             rows = tuple(row[lanes] for row in rows)
             r_t = np.where(fake, 0, r_t)

@@ -1,0 +1,127 @@
+"""Hooks show what happens and change nothing.
+
+Mutants that must die here: a line for every row where nobody watches · no line at all · returns forgotten between rows
+· a target that is not shown · numbers written at another step · a hook that changes the run.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuralq import hooks
+from neuralq.hooks import ProgressBar, TensorBoard
+from neuralq.learners import RolloutSettings
+from neuralq.q import MLP
+from neuralq.recipes import RunConfig, train
+from neuralq.record import read_metrics
+from neuralq.report import MissingExtra
+
+
+class Clock:
+    """Stands for `time`, so that no test waits."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+def row(steps: int, **more: Any) -> dict[str, Any]:
+    return {"kind": "train", "env_steps": steps, "steps_per_second": 1234.0, "episode_return": 20.25, **more}
+
+
+def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(hooks, "time", clock)
+    with ProgressBar(10_000, 475.0, stream) as bar:
+        for second in range(25):
+            clock.now = float(second)
+            bar(row(100 * second))
+            bar({"kind": "evaluation", "env_steps": 100 * second, "greedy_return": 99.5})
+    lines = stream.getvalue().splitlines()
+    assert lines == [
+        "1,100 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
+        "2,200 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
+    ]
+
+
+def test_a_row_without_returns_keeps_the_last_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(hooks, "time", clock)
+    with ProgressBar(100, stream=stream) as bar:
+        bar(row(10))
+        clock.now = 11.0
+        bar(row(20, episode_return=None))
+    assert stream.getvalue() == "20 steps · 1,234 steps/s · return 20.2\n"
+
+
+def test_in_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "120")
+    stream = Terminal()
+    with ProgressBar(1000, 475.0, stream) as bar:
+        bar(row(250))
+        bar({"kind": "evaluation", "env_steps": 250, "greedy_return": 99.5})
+    assert "250/1000" in stream.getvalue() and "1,234 steps/s" in stream.getvalue()
+    assert "greedy 99.5 (target 475)" in stream.getvalue()
+
+
+def test_the_bar_is_drawn_on_standard_error(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(hooks, "time", clock)
+    with ProgressBar(100) as bar:
+        clock.now = 11.0
+        bar(row(10))
+    captured = capsys.readouterr()
+    assert captured.out == "" and "10 steps" in captured.err
+
+
+def test_tensorboard_holds_every_number_at_its_step(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    board = TensorBoard(tmp_path)
+    board(row(64, loss=0.5))
+    board(row(128, loss=0.25, episode_return=None))
+    board({"kind": "evaluation", "env_steps": 128, "greedy_return": 30.0, "returns": [30.0]})
+    board.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert {t: [(e.step, e.value) for e in events.Scalars(t)] for t in events.Tags()["scalars"]} == {
+        "train/steps_per_second": [(64, 1234.0), (128, 1234.0)],
+        "train/episode_return": [(64, 20.25)],
+        "train/loss": [(64, 0.5), (128, 0.25)],
+        "evaluation/greedy_return": [(128, 30.0)],
+    }
+
+
+def test_a_missing_tensorboard_is_one_error_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MissingExtra, match=r'pip install "neuralq\[tensorboard\]"'):
+        TensorBoard(tmp_path / "board")
+    assert not (tmp_path / "board").exists()
+
+
+def test_hooks_see_every_row_that_is_stored_and_change_nothing(tmp_path: Path) -> None:
+    small = RolloutSettings(num_envs=2, num_steps=8)
+    config = RunConfig(
+        total_steps=96, evaluate_every=40, evaluation_episodes=1, log_every=20, rollout=small, body=MLP((8,))
+    )
+    seen: list[Any] = []
+    with ProgressBar(96, stream=io.StringIO()) as bar:
+        watched = train(config, tmp_path / "watched", [bar, lambda row: seen.append(dict(row))])
+    assert seen == read_metrics(tmp_path / "watched")
+    assert {row["kind"] for row in seen} == {"train", "evaluation"}
+    assert watched.parameters_sha256 == train(config, tmp_path / "alone").parameters_sha256
