@@ -39,7 +39,7 @@ class Evaluation:
 
 
 def evaluate_greedy(
-    values: Callable[[Tensor], Tensor], stream: Interaction, num_episodes: int, seed: int, max_steps: int = 27_000
+    values: Callable[[Tensor], Tensor], stream: Interaction, num_episodes: int, seed: int, max_steps: int = 10_000
 ) -> Evaluation:
     """Play ``num_episodes`` greedy episodes.
 
@@ -48,7 +48,7 @@ def evaluate_greedy(
         stream: an interaction with an environment made for evaluation; it is reset.
         num_episodes: how many; in rounds if there are more than lanes.
         seed: of the resets; the same seed meets the same episodes.
-        max_steps: bound on an episode where the environment has none (27,000 is Atari's half hour).
+        max_steps: bound on an episode where the environment has none.
 
     Returns:
         Returns and lengths in the order of lanes.

@@ -66,9 +66,9 @@ class Session:
     evaluation_stream: Interaction
     resumability: Resumability
 
-    def evaluate(self, num_episodes: int, seed: int) -> Evaluation:
+    def evaluate(self, num_episodes: int, seed: int, max_steps: int) -> Evaluation:
         """Greedy evaluation of the present parameters."""
-        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed)
+        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, max_steps)
 
     def close(self) -> None:
         """Close the environments."""
@@ -86,6 +86,7 @@ class Plan:
         stop_at_return: stop once a greedy evaluation averages at least this; None to use the whole budget.
         evaluate_every: steps between greedy evaluations.
         evaluation_episodes: episodes of each.
+        evaluation_max_steps: bound on an evaluation episode where the environment has none.
         checkpoint_every: steps between checkpoints.
         log_every: steps between rows of training metrics.
         seed: from which evaluation seeds are derived.
@@ -95,6 +96,7 @@ class Plan:
     stop_at_return: float | None
     evaluate_every: int
     evaluation_episodes: int
+    evaluation_max_steps: int
     checkpoint_every: int
     log_every: int
     seed: int
@@ -302,7 +304,8 @@ class _Loop:
         session, plan, progress = self.session, self.plan, self.progress
         progress.next_evaluation = (progress.env_steps // plan.evaluate_every + 1) * plan.evaluate_every
         progress.evaluated_at = progress.env_steps
-        result = session.evaluate(plan.evaluation_episodes, seed_for(plan.seed, 9, progress.env_steps))
+        seed = seed_for(plan.seed, 9, progress.env_steps)
+        result = session.evaluate(plan.evaluation_episodes, seed, plan.evaluation_max_steps)
         progress.greedy_return = result.mean
         progress.best_return = max(result.mean, -np.inf if progress.best_return is None else progress.best_return)
         if plan.stop_at_return is not None and progress.reached_at is None and result.mean >= plan.stop_at_return:

@@ -106,9 +106,9 @@ def test_evaluation_counts_as_wall_time_but_not_as_training(tmp_path: Path, monk
     now = [0.0]
     evaluate = training.Session.evaluate
 
-    def slow_evaluation(session: training.Session, num_episodes: int, seed: int) -> Evaluation:
+    def slow_evaluation(session: training.Session, num_episodes: int, seed: int, max_steps: int) -> Evaluation:
         now[0] += 100.0
-        return evaluate(session, num_episodes, seed)
+        return evaluate(session, num_episodes, seed, max_steps)
 
     def tick() -> float:
         now[0] += 0.001

@@ -218,6 +218,7 @@ def plan_of(config: RunConfig) -> Plan:
         stop_at_return=config.stop_at_return,
         evaluate_every=config.evaluate_every,
         evaluation_episodes=config.evaluation_episodes,
+        evaluation_max_steps=config.evaluation_max_steps,
         checkpoint_every=config.checkpoint_every,
         log_every=config.log_every,
         seed=config.seed,

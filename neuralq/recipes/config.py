@@ -49,6 +49,7 @@ class RunConfig:
         online: settings of the online learner; only with ``learner="online"``.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
+        evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
         checkpoint_every: environment steps between checkpoints.
         log_every: environment steps between rows of training metrics.
         engine: "auto", "torch" or "compiled".
@@ -74,6 +75,7 @@ class RunConfig:
     online: OnlineSettings | None = None
     evaluate_every: int = 4096
     evaluation_episodes: int = 20
+    evaluation_max_steps: int = 10_000
     checkpoint_every: int = 50_000
     log_every: int = 1024
     engine: str = "auto"
@@ -98,6 +100,7 @@ class RunConfig:
             "total_steps",
             "evaluate_every",
             "evaluation_episodes",
+            "evaluation_max_steps",
             "checkpoint_every",
             "log_every",
             "threads",
