@@ -23,7 +23,15 @@ from neuralq.checks import check_whole
 if TYPE_CHECKING:
     from neuralq.mdp import FiniteMDP
 
-__all__ = ["ModelEnv", "ModelVectorEnv", "Outcomes", "Sampler"]
+__all__ = ["ModelEnv", "ModelVectorEnv", "Outcomes", "Sampler", "short_sum"]
+
+
+def short_sum(mass: float) -> str:
+    """What to tell of a row whose probabilities sum to less than 1."""
+    return (
+        f"probabilities sum to {mass}, less than 1; if the missing probability is that of the episode's end, "
+        "pass substochastic=True"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +62,10 @@ class Outcomes:
         """The row of each outcome, ``[M]``."""
         return np.repeat(np.arange(len(self.indptr) - 1), np.diff(self.indptr))
 
-    def check(self, s_tm1: NDArray[np.int64], a_tm1: NDArray[np.int64], num_states: int) -> None:
-        """Every outcome is a probability, a finite reward and a state.
+    def check(
+        self, s_tm1: NDArray[np.int64], a_tm1: NDArray[np.int64], num_states: int, *, substochastic: bool = False
+    ) -> None:
+        """Every outcome is a probability, a finite reward and a state, and those of a row sum to 1.
 
         Raises:
             ValueError: the first that is not, with its row, its pair and its value.
@@ -74,6 +84,10 @@ class Outcomes:
         if bad.size:
             k = int(bad[0])
             raise ValueError(f"row {k} (s={s_tm1[k]}, a={a_tm1[k]}): probabilities sum to {mass[k]}, more than 1")
+        bad = np.flatnonzero(mass < 1 - 1e-9)
+        if bad.size and not substochastic:
+            k = int(bad[0])
+            raise ValueError(f"row {k} (s={s_tm1[k]}, a={a_tm1[k]}): {short_sum(mass[k])}")
 
     def expected(self, num_states: int) -> tuple[sparse.csr_array, NDArray[np.float64]]:
         """The continuing transition matrix ``[K, S]`` and the expected reward ``[K]`` of these outcomes."""
@@ -162,7 +176,7 @@ class ModelEnv(gymnasium.Env[Any, Any]):
 
     Example:
         >>> from neuralq.mdp import FiniteMDP
-        >>> env = ModelEnv(FiniteMDP.from_arrays([[[0.0]]], [[5.0]]))
+        >>> env = ModelEnv(FiniteMDP.from_arrays([[[0.0]]], [[5.0]], substochastic=True))
         >>> _ = env.reset(seed=0)
         >>> env.step(0)[:3]
         (0, 5.0, True)
@@ -183,9 +197,19 @@ class ModelEnv(gymnasium.Env[Any, Any]):
         return self._mdp
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
-        """A first state drawn from the start distribution."""
+        """A first state drawn from the start distribution, or the one that ``options["state"]`` names.
+
+        Raises:
+            ValueError: ``options["state"]`` that is not a state with an action.
+        """
         super().reset(seed=seed)
-        self._state, self._terminated = int(self._sampler.first_states(1, self.np_random)[0]), False
+        asked = None if options is None else options.get("state")
+        if asked is not None and not (self.observation_space.contains(asked) and self._mask[asked].any()):
+            raise ValueError(
+                f"options['state'] must be a state of 0..{self._mdp.num_states - 1} that has an action, got {asked!r}"
+            )
+        first = self._sampler.first_states(1, self.np_random)[0] if asked is None else asked
+        self._state, self._terminated = int(first), False
         return self._state, {"action_mask": self._mask[self._state].copy()}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
@@ -214,7 +238,7 @@ class ModelVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.int64], NDArray[np.in
 
     Example:
         >>> from neuralq.mdp import FiniteMDP
-        >>> envs = ModelVectorEnv(FiniteMDP.from_arrays([[[0.0]]], [[5.0]]), 2)
+        >>> envs = ModelVectorEnv(FiniteMDP.from_arrays([[[0.0]]], [[5.0]], substochastic=True), 2)
         >>> _ = envs.reset(seed=0)
         >>> envs.step(np.zeros(2, dtype=int))[2].tolist()
         [True, True]

@@ -1,0 +1,57 @@
+"""The cliff (Sutton & Barto 2018, example 6.6): 4 x 12 cells, −1 a step, −100 and back to the start over the edge.
+
+The shortest way along the edge takes 13 steps: the optimal return is −13 (γ = 1).
+"""
+
+from __future__ import annotations
+
+from neuralq.mdp import FiniteMDP
+from neuralq.simulate import ModelVectorEnv
+from neuralq_envs.drawn import DrawnEnv
+from neuralq_envs.grids import Grid
+
+__all__ = ["GAMMA", "GRID", "make", "make_vector", "mdp"]
+
+GAMMA = 1.0
+GRID = Grid(
+    """
+    ............
+    ............
+    ............
+    SCCCCCCCCCCG
+    """,
+    step_reward=-1.0,
+    goal_reward=-1.0,
+    cliff_reward=-100.0,
+)
+
+
+def mdp() -> FiniteMDP:
+    """The exact model; the ten cells of the cliff are states that nobody enters.
+
+    Example:
+        >>> mdp().num_states, mdp().num_rows
+        (48, 148)
+    """
+    return GRID.mdp()
+
+
+def make(render_mode: str | None = None) -> DrawnEnv:
+    """What ``gymnasium.make("neuralq/CliffWalking-v0")`` calls.
+
+    Example:
+        >>> env = make()
+        >>> env.reset(seed=0)[0], env.step(1)[:3]  # east of the start is the cliff
+        (36, (36, -100.0, False))
+    """
+    return GRID.env(render_mode)
+
+
+def make_vector(num_envs: int = 1, max_episode_steps: int | None = None) -> ModelVectorEnv:
+    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
+
+    Example:
+        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
+        [36, 36]
+    """
+    return GRID.vector_env(num_envs, max_episode_steps)
