@@ -74,6 +74,7 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
         f"   greedy return {run.greedy_return:.1f} over 20 episodes after {run.env_steps:,} steps: "
         f"{run.cpu_seconds:.2f} CPU-seconds of training, {run.wall_seconds:.1f} s with evaluation",
         highlight=False,
+        soft_wrap=True,
     )
     return run
 
@@ -103,11 +104,16 @@ def _star(
     console: Console, num_steps: int, gamma: float, step_size: float, num_upper: int
 ) -> tuple[list[BairdPrediction], list[BairdResult]]:
     console.print(
-        f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained"
+        f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained",
+        soft_wrap=True,
     )
     predictions = predict_baird(gamma, step_size, num_upper)
     for p in predictions:
-        console.print(f"   {p.representation:<14} ×{p.growth:.7f} per sweep: {p.verdict} ({p.scope})", highlight=False)
+        console.print(
+            f"   {p.representation:<14} ×{p.growth:.7f} per sweep: {p.verdict} ({p.scope})",
+            highlight=False,
+            soft_wrap=True,
+        )
     with console.status(f"running {num_steps:,} sweeps of each representation"):
         results = run_baird(num_steps, gamma, step_size, num_upper)
     table = Table("representation", "predicted", "measured", "largest |V|", "exact V", title="measured")
