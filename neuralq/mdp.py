@@ -23,10 +23,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from neuralq.checks import check_whole
-from neuralq.simulate import ModelEnv, ModelVectorEnv, Outcomes
+from neuralq.model_sources import garnet_rows, outcomes_of_functions
+from neuralq.simulate import ModelEnv, ModelVectorEnv, Outcomes, short_sum
 
 __all__ = ["FiniteMDP", "Outcomes"]
 
+_LARGEST_INDEX = np.iinfo(np.int32).max
 _SUM_TOLERANCE = 1e-9  # a row may miss 1 by this much: what decimal probabilities leave behind
 
 
@@ -52,7 +54,7 @@ class FiniteMDP:
         ValueError: a row or state that breaks these rules, by number, name and value.
 
     Example:
-        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.5]]], [[0.0], [1.0]])  # state 1 ends with probability .5
+        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.5]]], [[0.0], [1.0]], substochastic=True)
         >>> mdp.num_rows, mdp.termination.tolist()
         (2, [0.0, 0.5])
     """
@@ -122,6 +124,9 @@ class FiniteMDP:
 
     def _check_transition(self) -> None:
         transition = sparse.csr_array(self.transition, dtype=np.float64)
+        if max(transition.nnz, *transition.shape) <= _LARGEST_INDEX:  # half the memory to read in every sweep
+            index, starts = transition.indices.astype(np.int32), transition.indptr.astype(np.int32)
+            transition = sparse.csr_array((transition.data, index, starts), shape=transition.shape)
         object.__setattr__(self, "transition", transition)
         if transition.shape != (self.num_rows, self.num_states):
             raise ValueError(f"transition must have shape ({self.num_rows}, {self.num_states}), got {transition.shape}")
@@ -219,6 +224,7 @@ class FiniteMDP:
         reward: ArrayLike,
         *,
         legal: ArrayLike | None = None,
+        substochastic: bool = False,
         start: ArrayLike | None = None,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
@@ -226,10 +232,10 @@ class FiniteMDP:
         """Arrays ``P[a, s, s']`` and ``R[s, a]`` make an MDP; NaN in R, or False in ``legal``, marks an illegal action.
 
         Args:
-            transition: ``[A, S, S]``, or a sequence of A sparse ``[S, S]`` arrays. Rows that sum to less than 1 end the
-                episode with the missing probability.
+            transition: ``[A, S, S]``, or a sequence of A sparse ``[S, S]`` arrays. Rows of legal pairs sum to 1.
             reward: expected reward, ``[S, A]``.
             legal: optional mask, ``[S, A]``.
+            substochastic: whether rows may sum to less than 1; the missing probability ends the episode.
             start: optional start distribution, ``[S]``.
             state_names: optional.
             action_names: optional.
@@ -256,7 +262,11 @@ class FiniteMDP:
         order = np.lexsort((by_action // num_states, by_action % num_states))
         rows = sparse.vstack(blocks, format="csr")[by_action[order]]
         begin = None if start is None else np.asarray(start, dtype=np.float64)
-        return cls(num_states, num_actions, s_tm1, a_tm1, rows, reward[mask], None, begin, state_names, action_names)
+        mdp = cls(num_states, num_actions, s_tm1, a_tm1, rows, reward[mask], None, begin, state_names, action_names)
+        if not substochastic and mdp.termination.any():
+            row = int(np.argmax(mdp.termination > 0))
+            raise ValueError(f"{mdp.row_name(row)}: {short_sum(mdp.row_mass[row])}")
+        return mdp
 
     @classmethod
     def from_gymnasium(cls, env: gymnasium.Env[Any, Any]) -> FiniteMDP:
@@ -298,9 +308,11 @@ class FiniteMDP:
         actions: Callable[[int], Iterable[int]],
         transitions: Callable[[int, int], Iterable[tuple[float, int, float, bool]]],
         *,
+        substochastic: bool = False,
         start: ArrayLike | None = None,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> FiniteMDP:
         """Two functions make an MDP: each is called once per state and once per legal pair.
 
@@ -308,10 +320,12 @@ class FiniteMDP:
             num_states: S.
             num_actions: A.
             actions: legal actions of a state; none makes it terminal.
-            transitions: the ``(probability, s_t, reward, terminated)`` of a pair, which must sum to at most 1.
+            transitions: the ``(probability, s_t, reward, terminated)`` of a pair, which must sum to 1.
+            substochastic: whether rows may sum to less; the missing mass ends the episode with reward 0.
             start: optional start distribution, ``[S]``.
             state_names: optional.
             action_names: optional.
+            progress: optional, called a hundred times with the states that are built, and S.
 
         Raises:
             ValueError: a row that `FiniteMDP` refuses.
@@ -321,15 +335,8 @@ class FiniteMDP:
             >>> walk.termination.tolist()
             [0.0, 0.0, 1.0]
         """
-        pairs = [(s, int(a)) for s in range(num_states) for a in sorted(actions(s))]
-        found = [list(transitions(s, a)) for s, a in pairs]
-        indptr = np.concatenate([[0], np.cumsum([len(row) for row in found], dtype=np.int64)]).astype(np.int64)
-        columns = np.array([tuple(one) for row in found for one in row], dtype=np.float64).reshape(-1, 4)
-        s_tm1, a_tm1 = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        outcomes = Outcomes(
-            indptr, columns[:, 0].copy(), columns[:, 1].astype(np.int64), columns[:, 2].copy(), columns[:, 3] != 0
-        )
-        outcomes.check(s_tm1, a_tm1, num_states)
+        s_tm1, a_tm1, outcomes = outcomes_of_functions(num_states, actions, transitions, progress)
+        outcomes.check(s_tm1, a_tm1, num_states, substochastic=substochastic)
         transition, reward = outcomes.expected(num_states)
         begin = None if start is None else np.asarray(start, dtype=np.float64)
         return cls(
@@ -353,20 +360,9 @@ class FiniteMDP:
             check_whole(name, value)
         if branching > num_states:
             raise ValueError(f"branching must be at most num_states={num_states}, got {branching}")
-        rng = np.random.default_rng(seed)
-        k = num_states * num_actions
-        s_t = np.empty((k, branching), dtype=np.int64)
-        for j in range(branching):  # Floyd's algorithm: a uniform subset without replacement, all rows at once
-            largest = num_states - branching + j
-            draw = rng.integers(0, largest + 1, size=k)
-            s_t[:, j] = np.where((s_t[:, :j] == draw[:, None]).any(axis=1), largest, draw)
-        s_t.sort(axis=1)
-        cuts = np.sort(rng.random((k, branching - 1)), axis=1)
-        probability = np.diff(cuts, axis=1, prepend=0.0, append=1.0)
-        indptr = np.arange(0, k * branching + 1, branching)
-        transition = sparse.csr_array((probability.reshape(-1), s_t.reshape(-1), indptr), shape=(k, num_states))
-        s_tm1, a_tm1 = np.divmod(np.arange(k), num_actions)
-        return cls(num_states, num_actions, s_tm1, a_tm1, transition, rng.standard_normal(k))
+        transition, reward = garnet_rows(num_states, num_actions, branching, np.random.default_rng(seed))
+        s_tm1, a_tm1 = np.divmod(np.arange(len(reward)), num_actions)
+        return cls(num_states, num_actions, s_tm1, a_tm1, transition, reward)
 
     def as_env(self) -> ModelEnv:
         """This model as a Gymnasium environment; ``info["action_mask"]`` names the legal actions.

@@ -7,6 +7,7 @@ Pᵀ belongs in A; λ applied once too often; D of the target instead of the upd
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import gymnasium
@@ -17,9 +18,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
 
+from neuralq.exact import METHODS as ALL_METHODS
 from neuralq.exact import (
     action_values,
+    count_optimal_policies,
     evaluate,
+    optimal_policies,
     policy_process,
     predict_expected_td,
     rmsve,
@@ -31,7 +35,7 @@ from neuralq_envs import mitchell
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.baird import critical_gamma
 
-METHODS = ["value-iteration", "policy-iteration"]
+METHODS = [method for method in ALL_METHODS if method != "bellman-ford"]
 X = np.nan
 
 
@@ -45,6 +49,10 @@ def test_figure_13_2(method: str) -> None:
     ties = [[1], [1], [], [0, 1], [0, 1], [0]]  # exercise 13.1: 2 × 2 optimal policies
     assert [np.flatnonzero(row).tolist() for row in answer.optimal_actions] == ties
     assert answer.converged and answer.bound <= 1e-8
+    assert count_optimal_policies(answer) == 4
+    assert sorted(policy.tolist() for policy in optimal_policies(answer)) == [
+        [1, 1, -1, north_or_east, also, 0] for north_or_east in (0, 1) for also in (0, 1)
+    ]
 
 
 def dense(mdp: FiniteMDP) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -81,12 +89,14 @@ def test_gymnasium_models_against_a_dense_solution(name: str, gamma: float) -> N
     assert (r + gamma * p @ v).max(axis=1) == pytest.approx(v, abs=1e-10)  # so v is optimal
     mdp = FiniteMDP.from_gymnasium(env)
     for method in METHODS:
-        limit = 60 if method == "policy-iteration" else None  # a solver that cycles fails here instead of hanging
+        if method == "labelled-rtdp" and name != "Taxi":
+            continue  # its checks grow with the greedy envelope: seconds where everything leads everywhere
+        limit = 60 if "policy" in method else None  # a solver that cycles fails here instead of hanging
         answer = solve(mdp, gamma, method, max_iterations=limit)
         assert answer.converged
         assert np.abs(answer.v - v).max() <= answer.bound + 1e-10 <= 2e-8
         assert evaluate(mdp, answer.policy, gamma) == pytest.approx(v, abs=1e-6)
-        if method == "policy-iteration":  # ties do not cycle
+        if "policy" in method:  # ties do not cycle
             assert answer.iterations < 40
 
 
@@ -106,10 +116,11 @@ def models(draw: st.DrawFn) -> FiniteMDP:
 
 @settings(max_examples=60, deadline=None)
 @given(models(), st.sampled_from([0.0, 0.5, 0.9, 0.97]))
-def test_both_methods_agree_within_their_bounds_and_solve_the_bellman_equation(mdp: FiniteMDP, gamma: float) -> None:
+def test_all_methods_agree_within_their_bounds_and_solve_the_bellman_equation(mdp: FiniteMDP, gamma: float) -> None:
     answers = [solve(mdp, gamma, method) for method in METHODS]
     assert all(answer.converged for answer in answers)
-    assert np.abs(answers[0].v - answers[1].v).max() <= answers[0].bound + answers[1].bound
+    for one, two in itertools.combinations(answers, 2):
+        assert np.abs(one.v - two.v).max() <= one.bound + two.bound, (one.method, two.method)
     p, r = dense(mdp)
     for answer in answers:
         backup = np.where(mdp.is_terminal, 0.0, (r + gamma * p @ answer.v).max(axis=1))
@@ -136,14 +147,14 @@ def test_the_bound_holds_wherever_a_solver_is_stopped(mdp: FiniteMDP, max_iterat
 
 def test_a_solver_that_stops_early_says_so() -> None:
     mdp = FiniteMDP.garnet(50, 3, 4, seed=0)
-    early = solve(mdp, 0.99, max_iterations=5)
+    early = solve(mdp, 0.99, "value-iteration", max_iterations=5)
     assert not early.converged and early.bound > 1e-8 and early.iterations == 5
     assert early.backups == 6 * mdp.num_rows
     # The bound is sharp on a single absorbing state: V_n = Σ γ^k, k < n, is off by exactly γ^n / (1 − γ).
-    loop = solve(FiniteMDP.from_arrays([[[1.0]]], [[1.0]]), 0.5, max_iterations=3)
+    loop = solve(FiniteMDP.from_arrays([[[1.0]]], [[1.0]]), 0.5, "gauss-seidel", max_iterations=3)
     assert loop.v[0] == 1.875 and loop.bound == pytest.approx(0.125)
-    # A tolerance below rounding is not claimed.
-    assert not solve(FiniteMDP.from_arrays([[[1.0]]], [[1e9]]), 0.99, tol=1e-12).converged
+    for method in METHODS:  # a tolerance below rounding is not claimed
+        assert not solve(FiniteMDP.from_arrays([[[1.0]]], [[1e9]]), 0.99, method, tol=1e-12).converged
 
 
 def test_large_ties_do_not_cycle() -> None:
@@ -153,6 +164,7 @@ def test_large_ties_do_not_cycle() -> None:
     mdp = FiniteMDP.from_arrays(blocks, np.repeat(one.reward[:, None], 4, axis=1))
     answer = solve(mdp, 0.99, "policy-iteration")
     assert answer.iterations == 1 and answer.optimal_actions.all() and answer.policy.tolist() == [0] * 60
+    assert count_optimal_policies(answer) == 4**60
 
 
 def test_random_policies_against_dense_linear_algebra() -> None:
@@ -183,8 +195,8 @@ def test_undiscounted_walk_and_improper_policies() -> None:
     assert evaluate(walk(), [1] * 5, 1.0).tolist() == [1.0] * 5
     with pytest.raises(ValueError, match="from state 0 it never does; use gamma < 1"):
         evaluate(walk(), [1, 0, 0, 0, 0], 1.0)
-    with pytest.raises(ValueError, match=r"gamma=1 does not contract: row 1 \(s=0, a=1\) never ends"):
-        solve(walk(), 1)
+    with pytest.raises(ValueError, match=r"gamma=1 does not contract: row 1 \(s=0, a=1\) can be repeated for ever"):
+        solve(walk(), 1, "value-iteration")
 
 
 @pytest.mark.parametrize(
@@ -214,7 +226,7 @@ def test_broken_arguments_are_named() -> None:
     mdp = walk()
     for call, message in [
         (lambda: solve(mdp, 1.5), "gamma must lie in"),
-        (lambda: solve(mdp, 0.9, "magic"), "method must be one of 'value-iteration', 'policy-iteration'"),
+        (lambda: solve(mdp, 0.9, "magic"), "method must be one of 'auto', 'value-iteration', 'gauss-seidel'"),
         (lambda: solve(mdp, 0.9, tol=0.0), "tol must be a finite number above 0"),
         (lambda: solve(mdp, 0.9, max_iterations=0), "max_iterations"),
         (lambda: td_operator(np.eye(2), [0, 0], np.eye(2), [0.5, 0.5], 0.9, 1.5), "for Monte Carlo use lambda_=1"),

@@ -28,7 +28,7 @@ R = np.array([[1.0, 2.0], [3.0, np.nan], [np.nan, np.nan]])
 
 
 def small() -> FiniteMDP:
-    return FiniteMDP.from_arrays(P, R)
+    return FiniteMDP.from_arrays(P, R, substochastic=True)
 
 
 def test_arrays_give_one_row_per_legal_pair_in_state_order() -> None:
@@ -47,7 +47,7 @@ def test_arrays_give_one_row_per_legal_pair_in_state_order() -> None:
 
 def test_sparse_blocks_and_a_mask_say_the_same() -> None:
     blocks = [sparse.csr_array(p) for p in P]
-    other = FiniteMDP.from_arrays(blocks, np.nan_to_num(R), legal=~np.isnan(R))
+    other = FiniteMDP.from_arrays(blocks, np.nan_to_num(R), legal=~np.isnan(R), substochastic=True)
     assert (other.transition != small().transition).nnz == 0
     assert np.array_equal(other.reward, small().reward)
 
@@ -96,6 +96,14 @@ def test_a_broken_model_is_refused_by_row_and_value(parts: dict[str, object], me
 def test_other_sources_refuse_by_row_and_value_too() -> None:
     with pytest.raises(ValueError, match=r"got R of shape \(2, 3\)"):
         FiniteMDP.from_arrays(P, np.zeros((2, 3)))
+    with pytest.raises(
+        ValueError, match=r"row 2 \(s=1, a=0\): probabilities sum to 0\.7, less than 1; .*substochastic"
+    ):
+        FiniteMDP.from_arrays(P, R)
+    with pytest.raises(
+        ValueError, match=r"row 0 \(s=0, a=0\): probabilities sum to 0\.25, less than 1; .*substochastic"
+    ):
+        FiniteMDP.from_functions(1, 1, lambda s: [0], lambda s, a: [(0.25, 0, 0.0, True)])
     with pytest.raises(ValueError, match="every state is terminal"):
         FiniteMDP.from_arrays(P, np.full((3, 2), np.nan))
     for outcome, message in [
@@ -109,6 +117,23 @@ def test_other_sources_refuse_by_row_and_value_too() -> None:
             FiniteMDP.from_functions(2, 1, lambda s: [0], lambda s, a, rows=rows: rows[s])
     with pytest.raises(ValueError, match=r"has no transition table"):
         FiniteMDP.from_gymnasium(gymnasium.make("CartPole-v1"))
+
+
+def test_a_long_build_tells_how_far_it_is() -> None:
+    told: list[tuple[int, int]] = []
+    FiniteMDP.from_functions(
+        250,
+        1,
+        lambda s: [0],
+        lambda s, a: [(1.0, s, 0.0, False)],
+        progress=lambda built, total: told.append((built, total)),
+    )
+    assert told[0] == (3, 250) and told[-1] == (250, 250) and len(told) == 84
+
+
+def test_indices_take_half_the_memory_where_they_can() -> None:
+    mdp = FiniteMDP.garnet(5, 2, 2, seed=0)
+    assert mdp.transition.indices.dtype == mdp.transition.indptr.dtype == np.int32
 
 
 def test_functions_sum_duplicates_and_drop_terminated_mass() -> None:
@@ -168,7 +193,9 @@ OUTCOMES = {
 
 
 def test_simulated_frequencies_and_rewards_are_the_models_own() -> None:
-    mdp = FiniteMDP.from_functions(3, 1, lambda s: [0] if s < 2 else [], lambda s, a: OUTCOMES[s], start=[0.5, 0.5, 0])
+    mdp = FiniteMDP.from_functions(
+        3, 1, lambda s: [0] if s < 2 else [], lambda s, a: OUTCOMES[s], substochastic=True, start=[0.5, 0.5, 0]
+    )
     num = 40_000
     envs = mdp.as_vector_env(num)
     s_tm1, _ = envs.reset(seed=5)
@@ -186,7 +213,7 @@ def test_simulated_frequencies_and_rewards_are_the_models_own() -> None:
 
 
 def test_simulation_without_outcomes_follows_the_matrix() -> None:
-    mdp = FiniteMDP.from_arrays(P, R, start=[0.0, 1.0, 0.0])
+    mdp = FiniteMDP.from_arrays(P, R, substochastic=True, start=[0.0, 1.0, 0.0])
     num = 20_000
     envs = mdp.as_vector_env(num)
     envs.reset(seed=0)
@@ -234,7 +261,7 @@ def test_single_environment_passes_the_checker_and_repeats_itself() -> None:
 
 
 def test_illegal_actions_stay_with_reward_zero_and_the_mask_tells() -> None:
-    mdp = FiniteMDP.from_arrays(P, R, start=[0.0, 1.0, 0.0])
+    mdp = FiniteMDP.from_arrays(P, R, substochastic=True, start=[0.0, 1.0, 0.0])
     env = mdp.as_env()
     s, extra = env.reset(seed=0)
     assert s == 1 and extra["action_mask"].tolist() == [1, 0]
@@ -246,7 +273,7 @@ def test_illegal_actions_stay_with_reward_zero_and_the_mask_tells() -> None:
 
 
 def test_ended_episodes_must_be_reset() -> None:
-    env = FiniteMDP.from_arrays([[[0.0]]], [[1.0]]).as_env()
+    env = FiniteMDP.from_arrays([[[0.0]]], [[1.0]], substochastic=True).as_env()
     with pytest.raises(ResetNeeded):
         env.step(0)
     env.reset(seed=0)
@@ -259,7 +286,7 @@ def test_ended_episodes_must_be_reset() -> None:
 
 
 def test_vector_environment_resets_what_the_mask_names() -> None:
-    mdp = FiniteMDP.from_arrays(P, R)
+    mdp = FiniteMDP.from_arrays(P, R, substochastic=True)
     envs = mdp.as_vector_env(64, max_episode_steps=3)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     assert envs.observation_space.shape == envs.action_space.shape == (64,)

@@ -1,17 +1,28 @@
 """The oracle: exact solutions of finite models and of expected linear TD, sharing no code with any learner."""
 
+from neuralq.exact.average import AverageEvaluation, AverageSolution, evaluate_average, solve_average
 from neuralq.exact.evaluation import action_values, evaluate, policy_process
+from neuralq.exact.horizon import HorizonSolution, solve_finite_horizon
 from neuralq.exact.operators import Prediction, predict_expected_td, rmsve, td_operator
-from neuralq.exact.planning import Solution, solve
+from neuralq.exact.planning import METHODS, Solution, count_optimal_policies, optimal_policies, solve
 
 __all__ = [
+    "METHODS",
+    "AverageEvaluation",
+    "AverageSolution",
+    "HorizonSolution",
     "Prediction",
     "Solution",
     "action_values",
+    "count_optimal_policies",
     "evaluate",
+    "evaluate_average",
+    "optimal_policies",
     "policy_process",
     "predict_expected_td",
     "rmsve",
     "solve",
+    "solve_average",
+    "solve_finite_horizon",
     "td_operator",
 ]

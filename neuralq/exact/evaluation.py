@@ -30,7 +30,7 @@ def policy_process(mdp: FiniteMDP, policy: ArrayLike) -> tuple[sparse.csr_array,
         ValueError: a policy of another shape, that takes an illegal action, or whose probabilities do not sum to 1.
 
     Example:
-        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.0]]], [[3.0], [1.0]])
+        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.0]]], [[3.0], [1.0]], substochastic=True)
         >>> P_pi, r_pi = policy_process(mdp, [0, 0])
         >>> P_pi.toarray().tolist(), r_pi.tolist()
         ([[0.0, 1.0], [0.0, 0.0]], [3.0, 1.0])
@@ -55,7 +55,7 @@ def evaluate(mdp: FiniteMDP, policy: ArrayLike, gamma: float) -> NDArray[np.floa
         ValueError: γ outside [0, 1], a policy that `policy_process` refuses, or γ = 1 with a policy that never ends.
 
     Example:
-        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.0]]], [[3.0], [1.0]])
+        >>> mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 0.0]]], [[3.0], [1.0]], substochastic=True)
         >>> evaluate(mdp, [0, 0], gamma=0.5).tolist()
         [3.5, 1.0]
     """

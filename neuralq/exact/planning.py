@@ -1,33 +1,54 @@
 """Optimal values of a known model, with a proof of how close they are.
 
-Let T be the Bellman optimality operator and c = γ · max over rows of discount · (mass that goes on). T is a
-c-contraction in the maximum norm (Puterman 1994, theorem 6.2.3), so for every V
-
-    ‖T V − V*‖∞ ≤ c / (1 − c) · ‖T V − V‖∞.
-
-Both methods end with one more application of T to what they found; its residual, and an allowance for the rounding of
-that very backup, make the reported `bound`. A run has converged when the bound is at most ``tol``.
-
-* value iteration repeats V ← T V;
-* policy iteration evaluates the policy exactly and changes an action only when another is better by more than rounding
-  can produce. So actions of equal value never make it cycle.
+However the values V were found, one more application of the Bellman optimality operator T proves what they are worth:
+V* lies within `Problem.interval` of T V, and an allowance for the rounding of that very backup is added. That makes the
+reported `bound`, a maximum norm and not a span; a run has converged when it is at most ``tol``. The methods are
+described where they are: `sweeping`, `policies`, `asynchronous`, `undiscounted`.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
-from neuralq.exact.evaluation import action_values, evaluate
+from neuralq.exact.asynchronous import labelled_rtdp, prioritized_sweeping, rtdp
+from neuralq.exact.kernels import best_of_rows, spread
+from neuralq.exact.policies import linear_programming, policy_iteration
+from neuralq.exact.problem import Found, Problem, prepare, q_of_rows
+from neuralq.exact.sweeping import gauss_seidel, modified_policy_iteration, value_iteration
+from neuralq.exact.undiscounted import (
+    bellman_ford,
+    certified,
+    episodic,
+    is_shortest_path,
+    path_rounding,
+    proper_policy_iteration,
+)
 from neuralq.mdp import FiniteMDP
 
-__all__ = ["METHODS", "Solution", "solve"]
+__all__ = ["METHODS", "Solution", "count_optimal_policies", "optimal_policies", "solve"]
 
-METHODS = ("value-iteration", "policy-iteration")
+Solver = Callable[[Problem, float, float], Found]
+
+_SOLVERS: dict[str, Solver] = {
+    "value-iteration": value_iteration,
+    "gauss-seidel": gauss_seidel,
+    "policy-iteration": policy_iteration,
+    "modified-policy-iteration": modified_policy_iteration,
+    "prioritized-sweeping": prioritized_sweeping,
+    "linear-programming": linear_programming,
+    "bellman-ford": bellman_ford,
+}
+_TRIALS = {"rtdp": rtdp, "labelled-rtdp": labelled_rtdp}
+METHODS = ("auto", *_SOLVERS, *_TRIALS)
+_SMALL = 2000  # states up to which factoring a policy's matrix is the quickest
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +58,16 @@ class Solution:
     Args:
         q: Q* ``[S, A]``, NaN where an action is not legal.
         v: V* ``[S]``, 0 at terminal states.
-        policy: an optimal action of every state, the lowest of those that tie, ``[S]``; -1 at terminal states.
+        policy: an optimal action of every state, ``[S]``; -1 at terminal states. It is the lowest of those that may be
+            optimal; with γ = 1 one that leads to an end; after an early stop the best so far.
         optimal_actions: every action that may be optimal given the bound, ``[S, A]``. None that is optimal is missing.
-        iterations: sweeps, or policies evaluated.
+        iterations: sweeps, policies evaluated, pivots, trials, or as many backups as there are states, by method.
         backups: applications of the Bellman equation to one state-action pair.
         residual: ‖T V − V‖∞ of the last backup.
         bound: guaranteed ‖v − V*‖∞.
         converged: whether the bound is at most the tolerance asked for.
         seconds: wall-clock time.
+        method: the method that found it.
     """
 
     q: NDArray[np.float64]
@@ -57,29 +80,37 @@ class Solution:
     bound: float
     converged: bool
     seconds: float
+    method: str
 
 
 def solve(
     mdp: FiniteMDP,
     gamma: float,
-    method: str = "value-iteration",
+    method: str = "auto",
     tol: float = 1e-8,
     *,
     max_iterations: int | None = None,
+    seed: int = 0,
 ) -> Solution:
-    """The optimal values and policy of a model, within a guaranteed bound.
+    """The optimal values and every optimal action of a model, within a guaranteed bound.
 
     Args:
         mdp: the model.
-        gamma: γ in [0, 1]; 1 only where every action may end the episode.
-        method: ``"value-iteration"`` or ``"policy-iteration"``.
+        gamma: γ in [0, 1]. With 1 episodes must end: ``"auto"`` and ``"policy-iteration"`` need a policy that ends them
+            from every state, and one that never does must earn less; other methods need that every policy ends them.
+        method: ``"value-iteration"``, ``"gauss-seidel"``, ``"policy-iteration"``, ``"modified-policy-iteration"``,
+            ``"prioritized-sweeping"``, ``"linear-programming"``, ``"rtdp"``, ``"labelled-rtdp"``, ``"bellman-ford"``
+            (deterministic with γ = 1 only), or ``"auto"``: Bellman–Ford where it applies, policy iteration for small
+            models, modified policy iteration for large ones.
         tol: largest ‖v − V*‖∞ to accept.
         max_iterations: stop after so many, with ``converged=False``; default: until nothing improves any more.
+        seed: of the simulated trials of the two RTDP methods.
 
     Raises:
-        ValueError: an argument out of range, or γ = 1 with an action that never ends.
+        ValueError: an argument out of range, a method that does not fit the model, or γ = 1 with episodes that cannot,
+            or should not, end; it names the row or state.
 
-    Source: Mitchell 1997, section 13.4; Puterman 1994, sections 6.3 and 6.4.
+    Source: Mitchell 1997, section 13.4; Puterman 1994, chapter 6; Barto, Bradtke & Singh 1995.
 
     Example:
         >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[1.0, 2.0]])  # one state: earn 1 or 2 for ever
@@ -90,90 +121,79 @@ def solve(
     check_discount("gamma", gamma)
     check_choice("method", method, METHODS)
     check_positive("tol", tol)
+    check_whole("seed", seed, minimum=0)
     if max_iterations is not None:
         check_whole("max_iterations", max_iterations)
     began = time.perf_counter()
-    modulus = _contraction(mdp, gamma)
-    run = _value_iteration if method == "value-iteration" else _policy_iteration
-    v, iterations, backups = run(mdp, gamma, modulus, tol, max_iterations)
-    q = action_values(mdp, v, gamma)
-    better = _best(q)
-    residual = float(np.max(np.abs(better - v)))
-    bound = (modulus * residual + _rounding(mdp, v)) / (1 - modulus)
-    # |q − Q*| ≤ c·‖V − V*‖ ≤ bound + residual: an optimal action lies within twice that of the best.
-    optimal = np.nan_to_num(q, nan=-np.inf) >= (better - 2 * (bound + residual))[:, None]
-    optimal &= mdp.legal
-    policy = np.where(mdp.is_terminal, -1, np.argmax(optimal, axis=1))
-    seconds = time.perf_counter() - began
-    backups += mdp.num_rows
-    return Solution(q, better, policy, optimal, iterations, backups, residual, bound, bound <= tol, seconds)
+    problem = prepare(mdp, gamma)
+    chosen = _automatic(problem) if method == "auto" else method
+    limit = math.inf if max_iterations is None else max_iterations
+    if math.isinf(problem.reach) and chosen != "bellman-ford":
+        problem = episodic(problem, chosen)
+    if chosen in _TRIALS:
+        found = _TRIALS[chosen](problem, tol, limit, seed)
+    elif chosen == "policy-iteration" and math.isinf(problem.reach):
+        found = proper_policy_iteration(problem, tol, limit)
+    else:
+        found = _SOLVERS[chosen](problem, tol, limit)
+    return _proven(problem, found, tol, chosen, began)
 
 
-def _contraction(mdp: FiniteMDP, gamma: float) -> float:
-    """The modulus of T in the maximum norm."""
-    row_modulus = gamma * mdp.row_discount * np.minimum(mdp.row_mass, 1.0)
-    modulus = float(np.max(row_modulus))
-    if modulus >= 1 - 1e-12:
-        raise ValueError(
-            f"gamma={gamma} does not contract: {mdp.row_name(int(np.argmax(row_modulus)))} never ends and loses "
-            "nothing; use gamma < 1"
-        )
-    return modulus
+def _automatic(problem: Problem) -> str:
+    """The method that suits a model."""
+    if is_shortest_path(problem):
+        return "bellman-ford"
+    small = problem.mdp.num_states <= _SMALL or math.isinf(problem.reach)
+    return "policy-iteration" if small else "modified-policy-iteration"
 
 
-def _rounding(mdp: FiniteMDP, v: NDArray[np.float64]) -> float:
-    """What rounding can do to one backup: each of its sums is off by half a unit in the last place."""
-    longest = int(np.max(np.diff(mdp.transition.indptr), initial=0))
-    size = float(np.max(np.abs(mdp.reward)) + np.max(np.abs(v)))
-    return (longest + 4) * float(np.finfo(np.float64).eps) * size
+def _proven(problem: Problem, found: Found, tol: float, method: str, began: float) -> Solution:
+    """One last application of T, and what it proves."""
+    mdp, v, rows = problem.mdp, found.v, problem.rows
+    values = q_of_rows(problem, v)
+    better, best_row = np.empty(mdp.num_states), np.empty(mdp.num_states, dtype=np.int64)
+    least, largest = best_of_rows(rows, values, v, better, best_row)
+    residual = max(-least, largest, 0.0)
+    if method == "bellman-ford":
+        bound = path_rounding(problem, v) if residual == 0 else math.inf
+    else:
+        problem = certified(problem, v)
+        down, up = problem.interval(least, largest)
+        bound = max(up, -down, 0.0) + problem.reach * problem.rounding(v)
+    converged = bound <= tol
+    q, optimal = np.full((mdp.num_states, mdp.num_actions), np.nan), np.zeros((mdp.num_states, mdp.num_actions), bool)
+    policy = np.empty(mdp.num_states, dtype=np.int64)
+    # |q − Q*| ≤ ‖V − V*‖ ≤ bound + residual: an optimal action lies within twice that of the best.
+    spread(rows, mdp.a_tm1, values, 2 * (bound + residual), q, optimal, policy)
+    if problem.gamma == 1 and found.policy is not None:
+        best_row = np.minimum(found.policy, mdp.num_rows - 1)  # any row where there is none
+    if not converged or problem.gamma == 1:
+        policy = np.where(mdp.is_terminal, -1, mdp.a_tm1[best_row])
+    backups, seconds = found.backups + mdp.num_rows, time.perf_counter() - began
+    return Solution(q, better, policy, optimal, found.iterations, backups, residual, bound, converged, seconds, method)
 
 
-def _best(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The largest legal value of every state; 0 where there is none."""
-    top: NDArray[np.float64] = np.max(np.nan_to_num(q, nan=-np.inf), axis=1)
-    return np.where(np.isneginf(top), 0.0, top)
+def count_optimal_policies(answer: Solution) -> int:
+    """How many deterministic policies take an optimal action in every state: Π_s |optimal actions of s|.
+
+    Source: Mitchell 1997, exercise 13.1.
+
+    Example:
+        >>> twins = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[2.0, 2.0]])
+        >>> count_optimal_policies(solve(twins, gamma=0.5))
+        2
+    """
+    return math.prod(int(n) for n in answer.optimal_actions.sum(axis=1) if n)
 
 
-def _value_iteration(
-    mdp: FiniteMDP, gamma: float, modulus: float, tol: float, max_iterations: int | None
-) -> tuple[NDArray[np.float64], int, int]:
-    lively = np.flatnonzero(~mdp.is_terminal)
-    first_row = mdp.row_starts[lively]
-    decay = gamma * mdp.row_discount
-    v = np.zeros(mdp.num_states)
-    best_residual, stalled, iterations = np.inf, 0, 0
-    patience = 20  # residuals shrink by the modulus; one that finds no new low is at the floor of rounding
-    while max_iterations is None or iterations < max_iterations:
-        better = np.zeros(mdp.num_states)
-        better[lively] = np.maximum.reduceat(mdp.reward + decay * (mdp.transition @ v), first_row)
-        residual = float(np.max(np.abs(better - v)))
-        v, iterations = better, iterations + 1
-        reach = tol * (1 - modulus) - modulus * residual
-        if residual == 0 or (reach >= 0 and _rounding(mdp, v) <= reach):
-            break
-        stalled = 0 if residual < best_residual else stalled + 1
-        best_residual = min(best_residual, residual)
-        if stalled > patience:
-            break
-    return v, iterations, iterations * mdp.num_rows
+def optimal_policies(answer: Solution) -> Iterator[NDArray[np.int64]]:
+    """Every deterministic optimal policy ``[S]``, one after the other, -1 at terminal states; the last state first.
 
-
-def _policy_iteration(
-    mdp: FiniteMDP, gamma: float, modulus: float, tol: float, max_iterations: int | None
-) -> tuple[NDArray[np.float64], int, int]:
-    states = np.arange(mdp.num_states)
-    q = action_values(mdp, np.zeros(mdp.num_states), gamma)
-    policy = np.argmax(np.nan_to_num(q, nan=-np.inf), axis=1)
-    v, iterations = np.zeros(mdp.num_states), 0
-    while max_iterations is None or iterations < max_iterations:
-        v = evaluate(mdp, policy, gamma)
-        q = action_values(mdp, v, gamma)
-        iterations += 1
-        challenger = np.argmax(np.nan_to_num(q, nan=-np.inf), axis=1)
-        gain = np.nan_to_num(q[states, challenger] - q[states, policy], nan=0.0)
-        # The incumbent stays unless it is beaten by more than the rounding of two evaluations can explain.
-        beaten = gain > 4 * _rounding(mdp, v) / (1 - modulus)
-        if not beaten.any():
-            break
-        policy = np.where(beaten, challenger, policy)
-    return v, iterations, iterations * mdp.num_rows
+    Example:
+        >>> twins = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[2.0, 2.0]])
+        >>> [policy.tolist() for policy in optimal_policies(solve(twins, gamma=0.5))]
+        [[0], [1]]
+    """
+    choices = [np.flatnonzero(row) if row.any() else np.array([-1]) for row in answer.optimal_actions]
+    for policy in itertools.product(*choices):
+        yield np.array(policy, dtype=np.int64)

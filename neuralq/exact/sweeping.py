@@ -1,0 +1,202 @@
+"""Whole sweeps over the states: value iteration, Gauss–Seidel, modified policy iteration.
+
+* Value iteration repeats V ← T V. Where all rows go on with one modulus, the middle of the interval [lo, hi] that
+  holds V* − T V is added at the end, so the *span* of the change decides when to stop (MacQueen 1966). A row far below
+  the best of its state cannot be the best before the values have moved apart by as much: once many rows are that far,
+  the others are copied into a smaller model and swept instead, for as long as the sum of all changes allows (temporary
+  action elimination, Hastings & van Nunen 1977; Puterman 1994, section 6.7). Every sweep equals one over all rows.
+* Gauss–Seidel replaces values as it goes, in alternating directions.
+* Modified policy iteration evaluates the present policy by sweeps over its own compact matrix γ P_π until the error
+  left is small beside that of the policy (Puterman & Shin 1978). An action gives way only to a strictly better one.
+
+Each stops when what it has is proven good enough, or when sweeps no longer help because rounding is all that is left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuralq.exact.kernels import (
+    Rows,
+    copy_survivors,
+    extract_policy,
+    improve,
+    improve_in_place,
+    look_ahead,
+    policy_sweep,
+    survivors,
+    sweep,
+)
+from neuralq.exact.problem import Found, Problem
+
+__all__ = ["PolicyMatrix", "gauss_seidel", "modified_policy_iteration", "value_iteration"]
+
+Floats = NDArray[np.float64]
+
+_PATIENCE = 20  # errors shrink by the modulus; one that finds no new low for so long is at the floor of rounding
+_WORTH_COPYING = 0.2  # share of rows that are far enough below the best
+_INNER_SHARE = 0.001  # an evaluation stops when its error is so much smaller than the policy's
+_MOST_INNER_SWEEPS = 200
+
+
+class _Progress:
+    """Whether the error still falls."""
+
+    def __init__(self) -> None:
+        self._best, self._stalled = np.inf, 0
+
+    def stalls(self, error: float) -> bool:
+        self._stalled = 0 if error < self._best else self._stalled + 1
+        self._best = min(self._best, error)
+        return self._stalled > _PATIENCE
+
+
+def value_iteration(problem: Problem, tol: float, limit: float) -> Found:
+    """V ← T V until V* is known within ``tol``."""
+    rows, progress = problem.rows, _Progress()
+    v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
+    iterations, backups, slack, before = 0, 0, np.inf, np.inf
+    budget = np.inf  # how far values may move apart until a row that was left out can be the best
+    # |V| never exceeds reach · max |r|, starting from 0; so it need not be looked at after every sweep.
+    rounding = 2 * problem.rounding(np.full(1, problem.largest_reward * problem.reach))
+    while iterations < limit:
+        least, largest, beaten = sweep(rows, v, better, slack + rounding)
+        v, better = better, v
+        iterations, backups = iterations + 1, backups + len(rows.reward)
+        error, allowance = _settle(problem, v, least, largest, tol)
+        if error + allowance <= tol or progress.stalls(error):
+            break
+        drift = _drift(problem, least, largest)
+        budget -= drift
+        slack = _further_drift(problem, drift, before)
+        before = drift
+        if budget < 0:
+            rows, budget = problem.rows, np.inf
+        elif beaten > _WORTH_COPYING * len(rows.reward):
+            rows = _surviving(rows, v, slack + rounding)
+            budget, backups = min(budget, slack), backups + beaten
+    return Found(v, iterations, backups)
+
+
+def _drift(problem: Problem, least: float, largest: float) -> float:
+    """How much the values of two rows can move against each other when V changes by least..largest."""
+    most, low = 1 - 1 / problem.reach, problem.least_modulus
+    return (most if largest > 0 else low) * largest - (most if least < 0 else low) * least
+
+
+def _further_drift(problem: Problem, drift: float, before: float) -> float:
+    """What the drift of all further sweeps will add up to, if it goes on to shrink as now, with a margin."""
+    if before == np.inf:
+        return np.inf  # nothing is known of the rate yet
+    rate = min(drift / before, 1 - 1 / problem.reach) if before > 0 else 0.0
+    return 1.5 * drift * rate / (1 - rate)
+
+
+def _settle(problem: Problem, v: Floats, least: float, largest: float, tol: float) -> tuple[float, float]:
+    """The proven error of ``v = T V``, and that of rounding; at the end a constant error, where known, is removed."""
+    down, up = problem.interval(least, largest)
+    error = (up - down) / 2 if problem.uniform else max(up, -down, 0.0)
+    if error > tol:
+        return error, 0.0  # rounding does not matter yet
+    allowance = problem.reach * problem.rounding(v)
+    if problem.uniform and error + allowance <= tol:
+        v[problem.acts] += (up + down) / 2
+    return error, allowance
+
+
+def _surviving(rows: Rows, v: Floats, slack: float) -> Rows:
+    """The rows that may still be optimal."""
+    q, kind = np.empty(len(rows.reward)), rows.starts.dtype
+    look_ahead(rows, v, q)
+    num_rows, num_entries = survivors(rows, q, slack)
+    reward = np.empty(num_rows)
+    fixed = reward.view()
+    fixed.flags.writeable = False  # as in the model: kernels are compiled for one type of array
+    out = Rows(
+        np.empty(len(rows.starts), dtype=kind),
+        np.empty(num_rows + 1, dtype=kind),
+        np.empty(num_entries, dtype=kind),
+        np.empty(num_entries),
+        fixed,
+        np.empty(num_rows),
+    )
+    copy_survivors(rows, q, slack, out, reward)
+    return out
+
+
+def gauss_seidel(problem: Problem, tol: float, limit: float) -> Found:
+    """V(s) ← (T V)(s), state by state, until V* is known within ``tol``."""
+    rows, progress = problem.rows, _Progress()
+    v, scratch = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
+    iterations, backups = 0, 0
+    while iterations < limit:
+        change = improve_in_place(rows, v, iterations % 2 == 1)
+        iterations, backups = iterations + 1, backups + len(rows.reward)
+        allowance = problem.reach * problem.rounding(v)
+        if (problem.reach - 1) * change + allowance <= tol or change == 0:
+            # The operator of one whole sweep contracts too, but the proof is about T: ask T.
+            least, largest, _ = sweep(rows, v, scratch, np.inf)
+            backups += len(rows.reward)
+            down, up = problem.interval(least, largest)
+            if max(up, -down, 0.0) + allowance <= tol or change == 0:
+                break
+        if progress.stalls(change):
+            break
+    return Found(v, iterations, backups)
+
+
+class PolicyMatrix:
+    """γ P_π and r_π of a deterministic policy, copied out of the model so that sweeps read nothing else.
+
+    Example:
+        >>> from neuralq.exact.problem import prepare
+        >>> from neuralq.mdp import FiniteMDP
+        >>> problem = prepare(FiniteMDP.from_arrays([[[1.0]]], [[2.0]]), 0.5)
+        >>> PolicyMatrix(problem, np.array([0], dtype=np.uint32)).evaluate(np.zeros(1), 0.0, 3, span=False)[0].tolist()
+        [3.5]
+    """
+
+    def __init__(self, problem: Problem, best_row: NDArray[np.unsignedinteger]) -> None:
+        rows, acts = problem.rows, problem.acts
+        used = best_row[acts].astype(np.int64)
+        num_entries = int(np.sum(rows.indptr[used + 1] - rows.indptr[used], dtype=np.int64))
+        kind = rows.starts.dtype
+        self._acts, self.size = acts, len(used)
+        self._indptr = np.empty(len(acts) + 1, dtype=kind)
+        self._column, self._weight = np.empty(num_entries, dtype=kind), np.empty(num_entries)
+        self._reward = np.zeros(len(acts))
+        self._reward[acts] = rows.reward[used]
+        extract_policy(rows, best_row, self._indptr, self._column, self._weight)
+
+    def evaluate(self, v: Floats, error: float, most_sweeps: int, *, span: bool = True) -> tuple[Floats, int]:
+        """V ← r_π + γ P_π V until the change (its span, or its size) is at most ``error``; returns V and the sweeps."""
+        other = np.empty_like(v)
+        sweeps = 0
+        while sweeps < most_sweeps:
+            sweeps += 1
+            least, largest = policy_sweep(self._indptr, self._column, self._weight, self._reward, self._acts, v, other)
+            v, other = other, v
+            if (largest - least if span else max(largest, -least)) <= error:
+                break
+        return v, sweeps
+
+
+def modified_policy_iteration(problem: Problem, tol: float, limit: float) -> Found:
+    """A sweep of improvement, then sweeps of the policy alone, until V* is known within ``tol``."""
+    rows, progress = problem.rows, _Progress()
+    v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
+    best_row = rows.starts[:-1].copy()
+    iterations, backups = 0, 0
+    while iterations < limit:
+        least, largest = improve(rows, v, better, best_row)
+        v, better = better, v
+        iterations, backups = iterations + 1, backups + len(rows.reward)
+        error, allowance = _settle(problem, v, least, largest, tol)
+        if error + allowance <= tol or progress.stalls(error):
+            break
+        policy = PolicyMatrix(problem, best_row)
+        change = largest - least if problem.uniform else max(largest, -least)
+        v, sweeps = policy.evaluate(v, _INNER_SHARE * change, _MOST_INNER_SWEEPS, span=problem.uniform)
+        backups += sweeps * policy.size
+    return Found(v, iterations, backups)
