@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from neuralq import recipes as recipes
     from neuralq import report as report
     from neuralq import rules as rules
+    from neuralq import tabular as tabular
     from neuralq.mdp import FiniteMDP as FiniteMDP
     from neuralq.q import ActionInputQ as ActionInputQ
     from neuralq.q import ActionOutputQ as ActionOutputQ
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from neuralq.recipes import load as load
     from neuralq.recipes import resume as resume
     from neuralq.recipes import train as train
+    from neuralq.recipes import with_preset as with_preset
     from neuralq.replay import ReplayBuffer as ReplayBuffer
     from neuralq.types import QFunction as QFunction
     from neuralq.types import Transition as Transition
@@ -54,7 +56,9 @@ __all__ = [
     "report",
     "resume",
     "rules",
+    "tabular",
     "train",
+    "with_preset",
 ]
 
 # Where each name lives. A name here must not be the name of a module of this package: importing the module would
@@ -74,6 +78,7 @@ _HOMES = {
     "load": "neuralq.recipes",
     "resume": "neuralq.recipes",
     "train": "neuralq.recipes",
+    "with_preset": "neuralq.recipes",
 }
 
 

@@ -19,7 +19,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 
-__all__ = ["kernel", "reassociating_kernel"]
+__all__ = ["kernel", "lean_kernel", "reassociating_kernel"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,6 +45,23 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=False)
 
 
+def lean_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, for functions that create no array: those they are given are not reference counted.
+
+    The caller holds the arrays for as long as the call lasts, so counting is waste; for kernels that pass tuples of
+    arrays to each other it takes three quarters of the time. A function that creates an array does not compile.
+
+    Example:
+        >>> import numpy as np
+        >>> @lean_kernel
+        ... def first(x: np.ndarray) -> float:
+        ...     return x[0]
+        >>> first(np.arange(4.0))
+        0.0
+    """
+    return _compile(function, fastmath=False, _nrt=False)
+
+
 def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """As `kernel`, but sums may be added in another order, so that they vectorise.
 
@@ -65,8 +82,8 @@ def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
-def _compile(function: Callable[P, R], fastmath: bool | set[str]) -> Callable[P, R]:
-    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+def _compile(function: Callable[P, R], **special: bool | set[str]) -> Callable[P, R]:
+    options = {"nogil": True, "error_model": "numpy", **special}
     try:
         compiled = _njit(cache=True, **options)(function)
     except RuntimeError as error:  # numba: "cannot cache function ...: no locator available for file ..."

@@ -1,0 +1,55 @@
+"""Every tabular learner of Mitchell's chapter 13 in compiled loops, on a model or on a Gymnasium environment."""
+
+from neuralq.tabular.average import r_learning
+from neuralq.tabular.control import apply, double_q, expected_sarsa, q_learning, sarsa
+from neuralq.tabular.engine import RunOptions
+from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
+from neuralq.tabular.model import Model, compile_model
+from neuralq.tabular.nstep import apply_n_step, n_step
+from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
+from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
+from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
+from neuralq.tabular.settings import EpsilonGreedy, KToTheQ, Power, RandomPolicy, Softmax, UpperConfidence, Visits
+from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
+from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
+
+__all__ = [
+    "Band",
+    "Curve",
+    "EpsilonGreedy",
+    "Experience",
+    "KToTheQ",
+    "Learned",
+    "Model",
+    "Power",
+    "RandomPolicy",
+    "RunOptions",
+    "Softmax",
+    "Sweeps",
+    "UpperConfidence",
+    "Visits",
+    "apply",
+    "apply_episodes",
+    "apply_lambda",
+    "apply_n_step",
+    "batch_td",
+    "compile_model",
+    "double_q",
+    "dyna_q",
+    "episodic_q_learning",
+    "expected_sarsa",
+    "n_step",
+    "over_seeds",
+    "predict",
+    "prioritized_sweeping",
+    "q_lambda",
+    "q_learning",
+    "queue_dyna",
+    "r_learning",
+    "robbins_monro_sums",
+    "sarsa",
+    "sarsa_lambda",
+    "sweep_errors",
+    "td_lambda",
+    "under_policy",
+]

@@ -1,0 +1,333 @@
+"""One loop around every tabular learner: on a model in compiled code, on a Gymnasium environment step by step.
+
+A learner owns its table and consumes transitions; where they come from is decided here. On an environment each step is
+taken in Python and handed to the same kernel as a stored transition, so both engines make the same update.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import ArrayLike, NDArray
+
+from neuralq.checks import check_choice, check_discount, check_whole
+from neuralq.mdp import FiniteMDP
+from neuralq.tabular.acting import (
+    ACTION,
+    EPISODE_STEPS,
+    EPISODES,
+    FORGET,
+    RECORD,
+    REPLAY,
+    STATE,
+    STEP,
+    Log,
+    Table,
+    Walk,
+    choose,
+    new_log,
+    new_walk,
+)
+from neuralq.tabular.model import RESTARTS, Model, ModelArrays, compile_model, empty_arrays
+from neuralq.tabular.results import Curve, Experience, Learned, masked
+from neuralq.tabular.settings import ActingCode
+from neuralq.tabular.streams import Seed
+
+__all__ = ["Learner", "RunOptions", "learn", "new_table", "replay", "table_from"]
+
+Source = FiniteMDP | Model | gymnasium.Env[Any, Any]
+"""What can be learned on: a model, the same compiled once for many runs, or an environment with finite spaces."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run starts from and what it records.
+
+    Args:
+        initial_q: value of every legal pair at the start, a number or ``[S, A]``; above the true values it is optimism.
+        max_episode_steps: a time limit: the episode is cut there, the bootstrap stays; None for none.
+        restarts: where episodes of a model begin: ``"model"`` (its start distribution) or ``"uniform"``.
+        record_every: steps between the records of the curve; None for no curve.
+        exact_q: the exact action values ``[S, A]`` to measure distances from.
+        record_experience: whether to return every transition.
+        change: ``(step, model)``: from that step on transitions come from another model with the same legal actions,
+            as in mazes whose walls move; None for a world that stays.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    initial_q: ArrayLike = 0.0
+    max_episode_steps: int | None = None
+    restarts: str = "model"
+    record_every: int | None = None
+    exact_q: ArrayLike | None = None
+    record_experience: bool = False
+    change: tuple[int, FiniteMDP] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range."""
+        check_choice("restarts", self.restarts, RESTARTS)
+        for name in ("max_episode_steps", "record_every"):
+            value = getattr(self, name)
+            if value is not None:
+                check_whole(name, value)
+        if self.change is not None:
+            check_whole("change step", self.change[0])
+        if self.exact_q is not None and self.record_every is None:
+            raise ValueError("exact_q is used for the curve; set record_every too")
+
+
+class Learner(Protocol):
+    """What the engine asks of a tabular learner."""
+
+    table: Table
+    policy: ActingCode
+    on_policy: bool
+
+    def run(self, model: ModelArrays, walk: Walk, log: Log, gamma: float, num_steps: int) -> Any:
+        """Consume ``num_steps`` transitions, from the model or from the log."""
+        ...
+
+
+def new_table(source: Source, options: RunOptions) -> tuple[Table, Source]:
+    """The table a run starts from, and the source ready to run.
+
+    Raises:
+        TypeError: a source of another kind, or an environment whose spaces are not finite.
+        ValueError: initial values of another shape.
+
+    Example:
+        >>> table, _ = new_table(FiniteMDP.garnet(3, 2, 2, seed=0), RunOptions(initial_q=1.0))
+        >>> table.q.tolist()
+        [[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]]
+    """
+    if isinstance(source, FiniteMDP):
+        source = compile_model(source, options.restarts)
+    elif options.restarts != "model":
+        raise ValueError(
+            f"restarts={options.restarts!r} is for a FiniteMDP; a compiled model has its restarts built in, and an "
+            "environment decides for itself"
+        )
+    if isinstance(source, Model):
+        legal = source.legal
+    elif isinstance(source, gymnasium.Env):
+        states, actions = source.observation_space, source.action_space
+        if not (isinstance(states, Discrete) and isinstance(actions, Discrete)):
+            raise TypeError(f"a table needs Discrete spaces, got {states} and {actions}; encode them in a wrapper")
+        legal = np.ones((int(states.n), int(actions.n)), dtype=bool)
+    else:
+        raise TypeError(f"learning needs a FiniteMDP, a compiled Model or a Gymnasium environment, got {source!r}")
+    values = np.asarray(options.initial_q, dtype=np.float64)
+    if values.shape not in ((), legal.shape):
+        raise ValueError(f"initial_q must be a number or have shape {legal.shape}, got shape {values.shape}")
+    start = np.broadcast_to(values, legal.shape)
+    if not np.isfinite(start[legal]).all():
+        s, a = np.argwhere(legal & ~np.isfinite(start))[0]
+        raise ValueError(f"initial_q must be finite where an action is legal, got {start[s, a]} at s={s}, a={a}")
+    return table_from(np.where(legal, start, -np.inf)), source
+
+
+def table_from(q: ArrayLike) -> Table:
+    """A table that starts from these values ``[S, A]``; NaN and −∞ mark illegal actions.
+
+    Raises:
+        ValueError: not a matrix.
+
+    Example:
+        >>> table_from([[1.0, np.nan]]).num_legal.tolist()
+        [1]
+    """
+    values = np.array(q, dtype=np.float64)
+    if values.ndim != 2:
+        raise ValueError(f"q must have shape [S, A], got shape {values.shape}")
+    values[np.isnan(values)] = -np.inf
+    legal = values > -np.inf
+    return Table(values, np.zeros(values.shape, dtype=np.int64), legal.sum(axis=1).astype(np.uint64))
+
+
+def learn(learner: Learner, source: Source, num_steps: int, gamma: float, seed: Seed, options: RunOptions) -> Learned:
+    """Run a learner for ``num_steps`` transitions.
+
+    Raises:
+        ValueError: a count or discount out of range, or an exact Q of another shape.
+    """
+    check_whole("num_steps", num_steps)
+    check_discount("gamma", gamma)
+    walk = new_walk(seed, options.max_episode_steps)
+    log = new_log(num_steps if options.record_experience else 0, RECORD if options.record_experience else FORGET)
+    later = _changed(source, options)
+    if isinstance(source, Model):
+        arrays, world = source.arrays, None
+    else:
+        assert isinstance(source, gymnasium.Env)
+        arrays, world = empty_arrays(), _World(source, learner, walk, seed)
+    # Compiled here, so that the clock measures learning.
+    learner.run(arrays, walk, log if world is None else new_log(0, REPLAY), gamma, 0)
+    recorder = _Recorder(learner.table.q, options)
+    chunk, seconds, taken = options.record_every or num_steps, 0.0, 0
+    while taken < num_steps:
+        count = min(chunk - taken % chunk, num_steps - taken)
+        if options.change is not None and later is not None:
+            if taken == options.change[0]:
+                arrays = later.arrays
+            elif taken < options.change[0]:
+                count = min(count, options.change[0] - taken)
+        began = time.thread_time()
+        if world is None:
+            learner.run(arrays, walk, log._replace(offset=taken), gamma, count)
+        else:
+            world.run(log._replace(offset=taken), gamma, count)
+        seconds += time.thread_time() - began
+        taken += count
+        if taken % chunk == 0 or taken == num_steps:
+            recorder.note(taken)
+    return _result(learner, walk, log, recorder, num_steps, seconds)
+
+
+def _changed(source: Source, options: RunOptions) -> Model | None:
+    """The model that ``options.change`` brings, checked against the first."""
+    if options.change is None:
+        return None
+    if not isinstance(source, Model):
+        raise ValueError("change is for models; an environment changes by itself")
+    later = compile_model(options.change[1])
+    if not np.array_equal(later.legal, source.legal):
+        raise ValueError("the model that change brings must have the same states and legal actions")
+    return later
+
+
+def replay(learner: Learner, experience: Experience, seed: Seed = 0) -> Learned:
+    """Run a learner over recorded transitions, in their order.
+
+    Raises:
+        ValueError: a state or action outside the table, or no next action where an on-policy rule needs one.
+    """
+    num_states, num_actions = learner.table.q.shape
+    for name, size in (("s_tm1", num_states), ("a_tm1", num_actions), ("s_t", num_states)):
+        column = getattr(experience, name)
+        bad = np.flatnonzero((column < 0) | (column >= size))
+        if bad.size:
+            raise ValueError(f"{name}[{bad[0]}] must lie in 0..{size - 1}, got {column[bad[0]]}")
+    lacking = np.flatnonzero((experience.next_actions < 0) & (experience.discount_t != 0))
+    beyond = np.flatnonzero(experience.next_actions >= num_actions)
+    if learner.on_policy and (lacking.size or beyond.size):
+        row = int(lacking[0] if lacking.size else beyond[0])
+        raise ValueError(f"row {row} bootstraps from the next action, but a_t is {experience.next_actions[row]} there")
+    e = experience
+    log = Log(REPLAY, 0, e.s_tm1, e.a_tm1, e.r_t, e.discount_t, e.s_t, e.next_actions, e.last_t)
+    walk = new_walk(seed)
+    learner.run(empty_arrays(), walk, log, 0.0, 0)
+    began = time.thread_time()
+    learner.run(empty_arrays(), walk, log, 0.0, len(e))
+    seconds = time.thread_time() - began
+    walk.counters[EPISODES] = int(e.last_t.sum())
+    return _result(learner, walk, log, _Recorder(learner.table.q, RunOptions()), len(e), seconds)
+
+
+def _result(learner: Learner, walk: Walk, log: Log, recorder: _Recorder, num_steps: int, seconds: float) -> Learned:
+    experience = None
+    lengths = np.zeros(0, dtype=np.int64)
+    if log.mode == RECORD:
+        experience = Experience(log.s_tm1, log.a_tm1, log.r_t, log.discount_t, log.s_t, log.last_t, log.a_t)
+        lengths = np.diff(np.flatnonzero(log.last_t), prepend=-1)
+    table = learner.table
+    return Learned(
+        q=masked(table.q), visits=table.visits.copy(), num_steps=num_steps, episode_lengths=lengths,
+        num_episodes=int(walk.counters[EPISODES]), num_backups=int(getattr(learner, "num_backups", num_steps)),
+        average_reward=float(getattr(learner, "average_reward", np.nan)), curve=recorder.curve(),
+        experience=experience, cpu_seconds=seconds,
+    )  # fmt: skip
+
+
+class _Recorder:
+    """The columns of a `Curve`, measured between chunks."""
+
+    def __init__(self, q: NDArray[np.float64], options: RunOptions) -> None:
+        self._q = q
+        self._wanted = options.record_every is not None
+        self._exact = None if options.exact_q is None else np.asarray(options.exact_q, dtype=np.float64)
+        if self._exact is not None and self._exact.shape != q.shape:
+            raise ValueError(f"exact_q must have shape {q.shape}, got {self._exact.shape}")
+        self._before = q.copy()
+        self._rows: list[tuple[float, ...]] = []
+
+    def note(self, step: int) -> None:
+        if not self._wanted:
+            return
+        legal = self._q > -np.inf
+        distance = excess = np.nan
+        if self._exact is not None:
+            known = legal & np.isfinite(self._exact)  # an environment shows only on the way which actions are legal
+            difference = self._q[known] - self._exact[known]
+            distance, excess = float(np.max(np.abs(difference))), float(np.max(difference))
+        fall = float(np.max(self._before[legal] - self._q[legal], initial=0.0))
+        self._rows.append((step, distance, excess, float(np.min(self._q[legal])), fall))
+        self._before[:] = self._q
+
+    def curve(self) -> Curve | None:
+        if not self._wanted:
+            return None
+        steps, *rest = np.array(self._rows, dtype=np.float64).T
+        return Curve(steps.astype(np.int64), *rest)
+
+
+class _World:
+    """A Gymnasium environment walked by a learner, one transition per kernel call."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], learner: Learner, walk: Walk, seed: Seed) -> None:
+        self._env, self._learner, self._walk = env, learner, walk
+        self._first = int(env.observation_space.start)  # type: ignore[attr-defined]
+        self._first_action = int(env.action_space.start)  # type: ignore[attr-defined]
+        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+        self._seed: int | None = int(sequence.generate_state(5)[4] >> 1)  # its own draw: not the policy's stream
+        self._limit = int(walk.counters[5])
+        self._seen = np.zeros(learner.table.q.shape[0], dtype=bool)
+        self._row = new_log(1, REPLAY)
+        self._nothing = empty_arrays()
+
+    def run(self, log: Log, gamma: float, num_steps: int) -> None:
+        counters, row = self._walk.counters, self._row
+        for i in range(num_steps):
+            if counters[STATE] < 0:
+                observation, extras = self._env.reset(seed=self._seed)
+                self._seed = None
+                counters[STATE] = int(observation) - self._first
+                self._learn_mask(int(counters[STATE]), extras)
+            s, step = int(counters[STATE]), int(counters[STEP])
+            a = int(counters[ACTION]) if counters[ACTION] >= 0 else self._choose(s, step)
+            observation, reward, terminated, truncated, extras = self._env.step(a + self._first_action)
+            s_t = int(observation) - self._first
+            self._learn_mask(s_t, extras)
+            counters[EPISODE_STEPS] += 1
+            last = terminated or truncated or 0 < self._limit <= counters[EPISODE_STEPS]
+            a_t = self._choose(s_t, step + 1) if self._learner.on_policy and not terminated else -1
+            values = (s, a, float(reward), 0.0 if terminated else gamma, s_t, a_t, last)
+            for column, value in zip(row[2:], values, strict=True):
+                column[0] = value
+            if log.mode == RECORD:
+                for column, value in zip(log[2:], values, strict=True):
+                    column[log.offset + i] = value
+            self._learner.run(self._nothing, self._walk, row, gamma, 1)
+            counters[STATE], counters[ACTION] = (-1, -1) if last else (s_t, a_t)
+            if last:
+                counters[EPISODE_STEPS] = 0
+                counters[EPISODES] += 1
+
+    def _choose(self, s: int, step: int) -> int:
+        return int(choose(self._learner.table, np.uint64(s), step, self._learner.policy, self._walk.rng))
+
+    def _learn_mask(self, s: int, extras: dict[str, Any]) -> None:
+        """The first sight of a state tells which actions it has."""
+        if self._seen[s] or "action_mask" not in extras:
+            return
+        self._seen[s] = True
+        mask = np.asarray(extras["action_mask"], dtype=bool)
+        if mask.any():  # a terminal state may say that it has none: nothing is ever chosen there
+            self._learner.table.q[s, ~mask] = -np.inf
+            self._learner.table.num_legal[s] = int(mask.sum())
