@@ -18,6 +18,7 @@ COMMANDS = {
     "evaluate": ("neuralq.cli.runs", "evaluate", "play greedy episodes with a trained run"),
     "report": ("neuralq.cli.runs", "report", "write a run's report.html"),
     "solve": ("neuralq.cli.exact", "solve", "compute the exact answer of an environment with a model"),
+    "chapter": ("neuralq.cli.chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13"),
     "baird": ("neuralq.cli.demo", "baird", "predict divergence on Baird's star, then measure it"),
     "demo": ("neuralq.cli.demo", "demo", "learn CartPole, predict a divergence, write a page about both"),
 }
