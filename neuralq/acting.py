@@ -118,6 +118,6 @@ def epsilon_greedy_policy(
     """
 
     def policy(s: Tensor) -> tuple[Tensor, Tensor]:
-        return choose_epsilon_greedy(values(s), epsilon(), rng.random(len(s)))
+        return choose_epsilon_greedy(values(s), epsilon(), rng.random(s.shape[0]))
 
     return policy

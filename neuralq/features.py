@@ -120,7 +120,7 @@ class _Part:
         else:
             with np.errstate(over="ignore"):  # beyond float32 becomes inf, which is refused below
                 copy = array.astype(np.float32)
-        if array.dtype.kind == "f" and not np.isfinite(copy).all():
+        if array.dtype.kind == "f" and np.count_nonzero(np.isfinite(copy)) < copy.size:
             self._refuse_not_finite(array, copy)
         return copy
 

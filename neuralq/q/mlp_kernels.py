@@ -60,7 +60,7 @@ def _normalise_rows(y: _Array, scale: _Array, shift: _Array, hat: _Array, invers
             y[i, j] = h * scale[j] + shift[j]
         if activation == 0:
             for j in range(width):
-                y[i, j] = max(y[i, j], y.dtype.type(0))
+                y[i, j] = y.dtype.type(0) if y[i, j] <= 0 else y[i, j]  # NaN stays
         else:
             for j in range(width):
                 y[i, j] = _activate(y[i, j], activation)
@@ -98,7 +98,8 @@ def _forward(
         else:
             for i in range(rows):
                 for j in range(fan_out):
-                    y[i, j] = max(y[i, j] + bias[j], params.dtype.type(0))
+                    v = y[i, j] + bias[j]
+                    y[i, j] = params.dtype.type(0) if v <= 0 else v  # NaN stays
         if not last:
             if plan[layer, 4] >= 0:
                 at = plan[layer, 4] + copy * fan_out
