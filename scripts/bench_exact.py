@@ -49,8 +49,8 @@ from neuralq.mdp import FiniteMDP
 try:
     from mdptoolbox.mdp import PolicyIterationModified
     from quantecon.markov import DiscreteDP
-except ImportError:
-    raise SystemExit('QuantEcon and pymdptoolbox are needed beside ours; run: pip install "neuralq[bench]"') from None
+except ImportError:  # said after the options are read, so that --help works without them
+    DiscreteDP = None
 
 TOLERANCE = 1e-8
 LARGEST_DENSE = 3000  # states
@@ -241,6 +241,8 @@ def main() -> None:
     parser.add_argument("--sweeps", type=int, default=20, help="sweeps of QuantEcon's value iteration (default 20)")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     options = parser.parse_args()
+    if DiscreteDP is None:
+        raise SystemExit('QuantEcon and pymdptoolbox are needed beside ours; run: pip install "neuralq[bench]"')
     if options.full:
         options.policy_states, options.sweep_states = 100_000, 1_000_000
     results = measure(options)

@@ -43,8 +43,8 @@ from neuralq import ReplayBuffer, Transition
 
 try:
     from stable_baselines3.common.buffers import ReplayBuffer as PeerBuffer
-except ImportError:
-    raise SystemExit('Stable-Baselines3 is needed beside ours; run: pip install "neuralq[bench]"') from None
+except ImportError:  # said after the options are read, so that --help works without them
+    PeerBuffer = None  # type: ignore[assignment, misc]
 
 NUM_STEPS = 64
 
@@ -134,6 +134,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.2, help="CPU time per round and buffer (default 0.2)")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     options = parser.parse_args()
+    if PeerBuffer is None:
+        raise SystemExit('Stable-Baselines3 is needed beside ours; run: pip install "neuralq[bench]"')
     torch.set_num_threads(1)
     print(f"{'observation':<15} {'operation':<16} {'ours [us]':>11} {'SB3 [us]':>10} {'ratio':>7}")
     results = {}

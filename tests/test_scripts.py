@@ -38,8 +38,6 @@ def numbers(text: str) -> list[float]:
 def test_docstring_names_the_command_and_help_answers(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if script == "bench_replay.py":
-        pytest.importorskip("stable_baselines3", reason="the bench extra is not installed")
     docstring = ast.get_docstring(ast.parse((ROOT / "scripts" / script).read_text()))
     assert docstring is not None and f"python scripts/{script}" in docstring
     with pytest.raises(SystemExit) as ended:
