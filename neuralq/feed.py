@@ -76,7 +76,7 @@ class _Rows:
 
     def __init__(self, num_steps: int, num_lanes: int, spec: ObservationSpec) -> None:
         lead = (num_steps, num_lanes)
-        self.fields = (
+        self.fields: tuple[_Array, ...] = (
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.zeros(lead, np.int64),
             np.ones(lead, np.float32),

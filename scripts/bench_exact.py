@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib.util
 import json
 import shutil
 import statistics
@@ -46,11 +47,11 @@ from neuralq.exact.kernels import sweep
 from neuralq.exact.problem import rows_of
 from neuralq.mdp import FiniteMDP
 
-try:
-    from mdptoolbox.mdp import PolicyIterationModified
-    from quantecon.markov import DiscreteDP
-except ImportError:  # said after the options are read, so that --help works without them
-    DiscreteDP = None
+DiscreteDP: Any = None  # without the peers only --help works
+PolicyIterationModified: Any = None
+if importlib.util.find_spec("quantecon") is not None and importlib.util.find_spec("mdptoolbox") is not None:
+    DiscreteDP = importlib.import_module("quantecon.markov").DiscreteDP
+    PolicyIterationModified = importlib.import_module("mdptoolbox.mdp").PolicyIterationModified
 
 TOLERANCE = 1e-8
 LARGEST_DENSE = 3000  # states
@@ -96,7 +97,7 @@ def alternating(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[
     return times, results
 
 
-def peer(mdp: FiniteMDP, gamma: float) -> DiscreteDP:
+def peer(mdp: FiniteMDP, gamma: float) -> Any:
     """The same model as QuantEcon takes it."""
     return DiscreteDP(np.array(mdp.reward), sparse.csr_matrix(mdp.transition), gamma, mdp.s_tm1, mdp.a_tm1)
 

@@ -28,6 +28,7 @@ program can raise: the ratio is then lower than in cache.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import statistics
 import time
@@ -41,10 +42,9 @@ import torch
 
 from neuralq import ReplayBuffer, Transition
 
-try:
-    from stable_baselines3.common.buffers import ReplayBuffer as PeerBuffer
-except ImportError:  # said after the options are read, so that --help works without them
-    PeerBuffer = None  # type: ignore[assignment, misc]
+PeerBuffer: Any = None  # without it only --help works
+if importlib.util.find_spec("stable_baselines3") is not None:
+    PeerBuffer = importlib.import_module("stable_baselines3.common.buffers").ReplayBuffer
 
 NUM_STEPS = 64
 
