@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuralq import rules
 from neuralq.checks import check_choice, check_positive
 from neuralq.q import mlp_kernels as kernels
 from neuralq.q.bodies import ACTIVATIONS, Trunk
@@ -104,11 +105,10 @@ class TorchEngine:
         _check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
         error = target.to(self.flat.values.dtype) - self.q.at(s, a)
-        if self.loss.kind == "squared":
-            each = 0.5 * error * error
-        else:
-            each = nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=self.loss.delta)
-        (each if weight is None else each * weight).mean().backward()  # type: ignore[no-untyped-call]
+        each = (
+            rules.squared(error, weight) if self.loss.kind == "squared" else rules.huber(error, self.loss.delta, weight)
+        )
+        each.mean().backward()  # type: ignore[no-untyped-call]
         return error.detach()
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
