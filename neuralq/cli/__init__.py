@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-__all__ = ["COMMANDS", "Failure", "main", "print_result"]
+__all__ = ["COMMANDS", "Failure", "command_parser", "main", "print_result"]
 
 COMMANDS = {
     "train": ("neuralq.cli.runs", "train", "train on a Gymnasium environment by TD(λ)"),
@@ -55,6 +55,18 @@ def _show_warning(
 ) -> None:
     """A warning for whoever typed the command: what it says, not where in the code."""
     print(f"neuralq: warning: {message}", file=sys.stderr)
+
+
+def command_parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
+    """The parser of one command: its examples stand below the options, and it takes ``--json``."""
+    parser = argparse.ArgumentParser(
+        prog=f"neuralq {name}",
+        description=description,
+        epilog="\n  ".join(["example:" if len(examples) == 1 else "examples:", *examples]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    return parser
 
 
 def _top_parser() -> argparse.ArgumentParser:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import textwrap
 import time
@@ -16,7 +15,7 @@ from neuralq.chapter import PAGES, run_page
 from neuralq.chapter.exhibit import Exhibit
 from neuralq.chapter.svg import exhibit_svg
 from neuralq.chapter.text import drawing_lines, shown
-from neuralq.cli import Failure, print_result
+from neuralq.cli import Failure, command_parser, print_result
 
 __all__ = ["chapter"]
 
@@ -25,16 +24,15 @@ _STYLES = {"agrees": "green", "differs": "bold red", "misprint": "yellow", "ours
 
 def chapter(argv: list[str]) -> int:
     """List the pages, or run one and print its numbers beside the printed ones."""
-    parser = argparse.ArgumentParser(
-        prog="neuralq chapter",
-        description="Mitchell's chapter on reinforcement learning (Machine Learning, 1997, chapter 13) as pages that "
+    parser = command_parser(
+        "chapter",
+        "Mitchell's chapter on reinforcement learning (Machine Learning, 1997, chapter 13) as pages that "
         "run. Without a page, lists them. The exit status is 1 if a number of the book is not reproduced.",
-        epilog="examples:\n  neuralq chapter\n  neuralq chapter fig-13.2 --svg grid.svg",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "neuralq chapter",
+        "neuralq chapter fig-13.2 --svg grid.svg",
     )
     parser.add_argument("page", nargs="?", choices=tuple(PAGES), metavar="PAGE", help="which page to run")
     parser.add_argument("--svg", metavar="PATH", help="also write the page's drawings to this SVG file")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     options = parser.parse_args(argv)
     if options.page is None:
         if options.svg is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 import time
@@ -13,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from neuralq.cli import Failure, print_result
+from neuralq.cli import Failure, command_parser, print_result
 from neuralq.hooks import ProgressBar
 from neuralq.lab import BairdPrediction, BairdResult, predict_baird, run_baird
 from neuralq.recipes import Run, RunConfig, preset_for, train
@@ -28,15 +27,13 @@ TARGET = 475.0
 
 def demo(argv: list[str]) -> int:
     """Learn CartPole, run Baird's star, write one page about both."""
-    parser = argparse.ArgumentParser(
-        prog="neuralq demo",
-        description="Learn CartPole-v1 by TD(λ), predict and measure divergence on Baird's star, write a page on both.",
-        epilog="example:\n  neuralq demo --seed 1",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "demo",
+        "Learn CartPole-v1 by TD(λ), predict and measure divergence on Baird's star, write a page on both.",
+        "neuralq demo --seed 1",
     )
     parser.add_argument("--folder", default="runs/demo", help="where the results go (default: runs/demo)")
     parser.add_argument("--seed", type=int, default=0, help="of the training run (default: 0)")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     options = parser.parse_args(argv)
     folder = Path(options.folder)
     began = time.perf_counter()
@@ -81,17 +78,15 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
 
 def baird(argv: list[str]) -> int:
     """Predict growth on Baird's star, then measure it."""
-    parser = argparse.ArgumentParser(
-        prog="neuralq baird",
-        description="Baird's star: what each representation will do under the same update, and what it does.",
-        epilog="example:\n  neuralq baird --gamma 0.85",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "baird",
+        "Baird's star: what each representation will do under the same update, and what it does.",
+        "neuralq baird --gamma 0.85",
     )
     parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99; the threshold is 15/17)")
     parser.add_argument("--step-size", type=float, default=0.01, help="α (default: 0.01)")
     parser.add_argument("--num-upper", type=int, default=6, help="upper states of the star (default: 6)")
     parser.add_argument("--num-steps", type=int, default=5000, help="sweeps (default: 5000)")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     options = parser.parse_args(argv)
     predictions, results = _star(
         Console(file=sys.stderr), options.num_steps, options.gamma, options.step_size, options.num_upper

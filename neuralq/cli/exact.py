@@ -16,7 +16,7 @@ from neuralq.chapter.exhibit import Arrow, Cell, Exhibit, Grid
 from neuralq.chapter.pictures import short
 from neuralq.chapter.svg import exhibit_svg
 from neuralq.chapter.text import ARROWS, drawing_lines
-from neuralq.cli import Failure, print_result
+from neuralq.cli import Failure, command_parser, print_result
 from neuralq.exact import METHODS, Solution, count_optimal_policies
 from neuralq.exact import solve as solve_mdp
 from neuralq.mdp import FiniteMDP
@@ -65,13 +65,13 @@ def solve(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="neuralq solve",
-        description="Compute V* and every optimal action of an environment with a transition table.",
-        epilog="examples:\n  neuralq solve FrozenLake-v1\n  neuralq solve neuralq/MitchellGrid-v0 --gamma 0.9",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage="neuralq solve [options] ENV",
+    parser = command_parser(
+        "solve",
+        "Compute V* and every optimal action of an environment with a transition table.",
+        "neuralq solve FrozenLake-v1",
+        "neuralq solve neuralq/MitchellGrid-v0 --gamma 0.9",
     )
+    parser.usage = "neuralq solve [options] ENV"
     parser.add_argument(
         "env", metavar="ENV", help="Gymnasium id of an environment with a transition table P, or one of neuralq's"
     )
@@ -85,7 +85,6 @@ def _parser() -> argparse.ArgumentParser:
         "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
     )
     parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
     return parser
 
 

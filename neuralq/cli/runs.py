@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import signal
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuralq.cli import Failure, print_result
+from neuralq.cli import Failure, command_parser, print_result
 from neuralq.cli.options import parse_train
 from neuralq.hooks import ProgressBar, TensorBoard
 from neuralq.recipes import Run, evaluate_run
@@ -46,7 +45,7 @@ def train(argv: list[str]) -> int:
 
 def resume(argv: list[str]) -> int:
     """Go on with a run."""
-    parser = _parser(
+    parser = command_parser(
         "resume", "Go on with a run from its newest intact checkpoint.", "neuralq resume runs/demo/cartpole"
     )
     parser.add_argument("run", help="run folder")
@@ -65,7 +64,9 @@ def resume(argv: list[str]) -> int:
 
 def evaluate(argv: list[str]) -> int:
     """Play greedy episodes with a run's newest checkpoint."""
-    parser = _parser("evaluate", "Play greedy episodes with a trained run.", "neuralq evaluate RUN --episodes 100")
+    parser = command_parser(
+        "evaluate", "Play greedy episodes with a trained run.", "neuralq evaluate RUN --episodes 100"
+    )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
@@ -95,23 +96,12 @@ def evaluate(argv: list[str]) -> int:
 
 def report(argv: list[str]) -> int:
     """Write a run's report."""
-    parser = _parser("report", "Write a run's report.html (extra plot).", "neuralq report RUN")
+    parser = command_parser("report", "Write a run's report.html (extra plot).", "neuralq report RUN")
     parser.add_argument("run", help="run folder")
     options = parser.parse_args(argv)
     path = write_report(options.run)
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
-
-
-def _parser(name: str, description: str, example: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=f"neuralq {name}",
-        description=description,
-        epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
-    return parser
 
 
 def _say(line: str) -> None:
