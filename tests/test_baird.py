@@ -37,14 +37,14 @@ RMSVE = {0: 5.318432, 10: 6.469824, 100: 19.545527, 500: 135.290776, 1000: 581.3
 def linear_star() -> LinearQ:
     q = LinearQ(8, 2)
     with torch.no_grad():
-        q.weight[SOLID] = torch.from_numpy(star().initial_weights)
+        q.weight[SOLID] = torch.tensor(star().initial_weights)
         q.weight[DASHED] = 3.0
     return q
 
 
 def test_linear_sweeps_are_the_books() -> None:
     q = linear_star()
-    backup = expected_backup(star(), torch.from_numpy(star().features))
+    backup = expected_backup(star(), torch.tensor(star().features))
     for k in range(1, 1001):
         expected_td_step(q, backup, 0.01)
         if k in SWEEPS:
@@ -86,7 +86,7 @@ def test_the_linear_features_diverge_at_the_predicted_rate(results: dict) -> Non
     for k, value in RMSVE.items():
         assert linear.rmsve[k] == pytest.approx(value, rel=1e-6)
     # Far out only the leading mode is left: the ratio of two sweeps is the radius.
-    q, backup = linear_star(), expected_backup(star(), torch.from_numpy(star().features))
+    q, backup = linear_star(), expected_backup(star(), torch.tensor(star().features))
     for _ in range(1000):
         before = backup.state_values(expected_td_step(q, backup, 0.05))
     after = backup.state_values(expected_td_step(q, backup, 0.05))
@@ -167,7 +167,7 @@ def load(q: torch.nn.Module, theta: NDArray[np.float64]) -> None:
 
 def update_by_differences(q: torch.nn.Module, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """F(θ) with ∇Q from central differences: Σ_s (1/7) (γ Q(lower, solid) − Q(s, solid)) ∇Q(s, solid)."""
-    x = torch.from_numpy(star().features)
+    x = torch.tensor(star().features)
 
     def solid(at: NDArray[np.float64]) -> NDArray[np.float64]:
         load(q, at)
@@ -186,7 +186,7 @@ def update_by_differences(q: torch.nn.Module, theta: NDArray[np.float64]) -> NDA
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_networks_step_is_the_semi_gradient(layout: type[torch.nn.Module]) -> None:
     q = layout((8,), 2, body=MLP(hidden=(5,), activation="tanh"), rng=0, dtype=torch.float64)
-    backup = expected_backup(star(), torch.from_numpy(star().features))
+    backup = expected_backup(star(), torch.tensor(star().features))
     before = flat(q)
     expected = update_by_differences(q, before)
     values = expected_td_step(q, backup, 0.1)
@@ -197,7 +197,7 @@ def test_a_networks_step_is_the_semi_gradient(layout: type[torch.nn.Module]) -> 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_local_growth_is_the_derivative_of_the_whole_update(layout: type[torch.nn.Module]) -> None:
     q = layout((8,), 2, body=MLP(hidden=(2,), activation="tanh"), rng=1, dtype=torch.float64)
-    backup = expected_backup(star(), torch.from_numpy(star().features))
+    backup = expected_backup(star(), torch.tensor(star().features))
     found = local_growth(q, backup, 0.5)
     theta = flat(q)
     steps = 1e-4 * np.eye(len(theta))
@@ -208,7 +208,7 @@ def test_local_growth_is_the_derivative_of_the_whole_update(layout: type[torch.n
 
 
 def test_local_growth_of_linear_representations_is_the_global_one() -> None:
-    linear = local_growth(linear_star(), expected_backup(star(), torch.from_numpy(star().features)), 0.01)
+    linear = local_growth(linear_star(), expected_backup(star(), torch.tensor(star().features)), 0.01)
     assert linear == pytest.approx(1.0023925, abs=5e-8)
     table = local_growth(TableQ(7, 2), expected_backup(star(), torch.arange(7)), 0.01)
     assert table == pytest.approx(1 - 1e-4 / 7, abs=1e-12)

@@ -21,7 +21,7 @@ from neuralq.checks import check_whole
 from neuralq.exact import evaluate, policy_process, predict_expected_td, rmsve, td_operator
 from neuralq.lab.expected import ExpectedBackup, QModule, expected_backup, expected_td_step, local_growth
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
-from neuralq_envs.counterexamples import Counterexample, star
+from neuralq_envs.counterexamples import Problem, star
 from neuralq_envs.counterexamples.baird import SOLID
 
 __all__ = ["CAP", "REPRESENTATIONS", "BairdPrediction", "BairdResult", "predict_baird", "run_baird"]
@@ -132,14 +132,14 @@ def predict_baird(
         return [_predict(problem, name, _start(problem, name, seed)) for name in REPRESENTATIONS]
 
 
-def _problem(gamma: float, step_size: float, num_upper: int, seed: int) -> Counterexample:
+def _problem(gamma: float, step_size: float, num_upper: int, seed: int) -> Problem:
     check_whole("seed", seed, minimum=0)
     if gamma == 1:
         raise ValueError("gamma must be below 1, got 1: the star never ends, so its values would not be defined")
     return replace(star(num_upper), gamma=gamma, step_size=step_size)
 
 
-def _table(problem: Counterexample) -> Start:
+def _table(problem: Problem) -> Start:
     """Values start at 1, the direction in which a table is slowest, and a little off it for every other to show."""
     q = TableQ(problem.mdp.num_states, problem.mdp.num_actions)
     with torch.no_grad():
@@ -148,23 +148,23 @@ def _table(problem: Counterexample) -> Start:
     return q, expected_backup(problem, torch.arange(problem.mdp.num_states))
 
 
-def _linear(problem: Counterexample) -> Start:
+def _linear(problem: Problem) -> Start:
     """The star's features and initial weights, for the target's action; the other starts at 0 and is never updated."""
     q = LinearQ(problem.features.shape[1], problem.mdp.num_actions)
     with torch.no_grad():
-        q.weight[SOLID] = torch.from_numpy(problem.initial_weights)
-    return q, expected_backup(problem, torch.from_numpy(problem.features))
+        q.weight[SOLID] = torch.tensor(problem.initial_weights)
+    return q, expected_backup(problem, torch.tensor(problem.features))
 
 
-def _network(problem: Counterexample, layout: Callable[..., QModule], seed: int) -> Start:
+def _network(problem: Problem, layout: Callable[..., QModule], seed: int) -> Start:
     """A network that sees the star's features."""
     rng = np.random.default_rng(seed)
     shape = (problem.features.shape[1],)
     q = layout(shape, problem.mdp.num_actions, body=_BODY, rng=rng, dtype=torch.float64)
-    return q, expected_backup(problem, torch.from_numpy(problem.features))
+    return q, expected_backup(problem, torch.tensor(problem.features))
 
 
-def _start(problem: Counterexample, name: str, seed: int) -> Start:
+def _start(problem: Problem, name: str, seed: int) -> Start:
     if name == "table":
         return _table(problem)
     if name == "linear":
@@ -173,7 +173,7 @@ def _start(problem: Counterexample, name: str, seed: int) -> Start:
     return _network(problem, layouts[name], seed)
 
 
-def _predict(problem: Counterexample, name: str, start: Start) -> BairdPrediction:
+def _predict(problem: Problem, name: str, start: Start) -> BairdPrediction:
     if name in ("table", "linear"):
         features = np.eye(problem.mdp.num_states) if name == "table" else problem.features
         process = policy_process(problem.mdp, problem.target_policy)
@@ -185,7 +185,7 @@ def _predict(problem: Counterexample, name: str, start: Start) -> BairdPredictio
     return BairdPrediction(name, growth, "local", "grows" if growth > 1 else "shrinks")
 
 
-def _run(problem: Counterexample, name: str, num_steps: int, seed: int) -> BairdResult:
+def _run(problem: Problem, name: str, num_steps: int, seed: int) -> BairdResult:
     q, backup = start = _start(problem, name, seed)
     prediction = _predict(problem, name, start)
     exact_values = evaluate(problem.mdp, problem.target_policy, problem.gamma)

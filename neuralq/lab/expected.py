@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_positive
-from neuralq_envs.counterexamples import Counterexample
+from neuralq_envs.counterexamples import Problem
 
 __all__ = ["ExpectedBackup", "QModule", "expected_backup", "expected_td_step", "local_growth"]
 
@@ -58,7 +58,7 @@ class ExpectedBackup:
         return self.rewards + self.gamma * (self.transitions @ self.state_values(q)) - q
 
 
-def expected_backup(problem: Counterexample, observations: Tensor) -> ExpectedBackup:
+def expected_backup(problem: Problem, observations: Tensor) -> ExpectedBackup:
     """A counterexample becomes tensors for a representation that sees ``observations`` (one row per state).
 
     Raises:
@@ -86,7 +86,7 @@ def expected_backup(problem: Counterexample, observations: Tensor) -> ExpectedBa
         torch.from_numpy(weights),
         torch.from_numpy(rewards),
         torch.from_numpy(transitions),
-        torch.from_numpy(np.array(problem.target_policy)),
+        torch.tensor(problem.target_policy),
         problem.gamma,
     )
 

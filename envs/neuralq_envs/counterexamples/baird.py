@@ -23,14 +23,14 @@ import numpy as np
 from neuralq.checks import check_whole
 from neuralq.mdp import FiniteMDP
 from neuralq.simulate import ModelEnv, ModelVectorEnv
-from neuralq_envs.counterexamples.problem import Counterexample
+from neuralq_envs.counterexamples.problem import Problem
 
 __all__ = ["DASHED", "SOLID", "critical_gamma", "make", "make_vector", "star"]
 
 DASHED, SOLID = 0, 1
 
 
-def star(num_upper: int = 6) -> Counterexample:
+def star(num_upper: int = 6) -> Problem:
     """Baird's star with ``num_upper`` upper states; 6 gives the figure of Sutton & Barto 2018.
 
     Raises:
@@ -54,8 +54,8 @@ def star(num_upper: int = 6) -> Counterexample:
     weights[n] = 10.0
     names = [*(f"upper {i}" for i in range(n)), "lower"]
     model = FiniteMDP.from_arrays(transition, np.zeros((n + 1, 2)), state_names=names, action_names=("dashed", "solid"))
-    return Counterexample(
-        name="Baird's star",
+    return Problem(
+        name="baird",
         mdp=model,
         features=features,
         target_policy=np.tile([0.0, 1.0], (n + 1, 1)),
@@ -64,7 +64,9 @@ def star(num_upper: int = 6) -> Counterexample:
         initial_weights=weights,
         gamma=0.99,
         step_size=0.01,
+        title="Baird's star",
         source="Baird 1995; Sutton & Barto 2018, section 11.2",
+        known=f"Expected TD(0) diverges at every step size iff γ > (n + 9)/(2n + 5) = {critical_gamma(n):.4f}.",
     )
 
 
