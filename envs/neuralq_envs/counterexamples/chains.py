@@ -60,7 +60,8 @@ def stationary_distribution(mdp: FiniteMDP, policy: NDArray[np.float64]) -> NDAr
         share = np.append(head, 1.0)
     out = np.zeros(mdp.num_states)
     out[recurrent] = np.maximum(share, 0.0)
-    return out / out.sum()
+    distribution: NDArray[np.float64] = out / out.sum()
+    return distribution
 
 
 def _recurrent_states(chain: sparse.csr_array, start: NDArray[np.bool_]) -> NDArray[np.int64]:

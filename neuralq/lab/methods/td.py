@@ -1,0 +1,94 @@
+"""TD(λ), ridge TD and the residual methods.
+
+With D = diag of how often each row is updated:
+
+    TD(λ)          A = Xᵀ D (I − γλP)⁻¹ (I − γP) X,   w += α δ z,  z = ρ (γλ z + x)
+    ridge          A + η I
+    residual(φ)    A_φ = (X − φγPX)ᵀ D (X − γPX),     w += α ρ δ (x − φγ x'')
+
+with x'' a second, independent successor under the target policy. Using x' itself instead (the naive residual gradient)
+descends E[ρδ²], another objective where transitions are random (Baird 1995; Sutton & Barto 2018, section 11.5).
+The ratio multiplies the trace, once; multiplying δ by it as well would count it twice.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
+from neuralq.lab.methods.operators import naive_residual, td
+from neuralq.lab.process import Process
+from neuralq.lab.sampling import Sample
+
+__all__ = ["NAIVE_RESIDUAL", "RESIDUAL", "TD"]
+
+
+class _TD:
+    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
+        self.theta = w0.copy()
+        self._z = np.zeros_like(w0)
+        self._decay = np.zeros(len(w0))  # discount into the present row, times λ
+        self._lambda, self._eta = options["lambda_"], options["eta"]
+
+    def update(self, sample: Sample, step_size: float) -> None:
+        w = self.theta
+        decay = np.where(sample.begins, 0.0, self._decay)
+        self._z = sample.rho[:, None] * (decay[:, None] * self._z + sample.x)
+        delta = errors(w, sample)
+        w += step_size * (delta[:, None] * self._z - self._eta * w)
+        self._decay = sample.discount * self._lambda
+
+
+class _Residual:
+    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
+        self.theta = w0.copy()
+        self._phi = options["phi"]
+
+    def update(self, sample: Sample, step_size: float) -> None:
+        second = (self._phi * sample.discount_second)[:, None] * sample.x_second
+        self.theta += (step_size * sample.rho * errors(self.theta, sample))[:, None] * (sample.x - second)
+
+
+class _NaiveResidual:
+    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
+        self.theta = w0.copy()
+
+    def update(self, sample: Sample, step_size: float) -> None:
+        back = sample.x - sample.discount[:, None] * sample.x_next
+        self.theta += (step_size * sample.rho * errors(self.theta, sample))[:, None] * back
+
+
+def errors(w: Floats, sample: Sample) -> Floats:
+    """δ = r + γ w·x' − w·x of every seed, ``[N, d] -> [N]``."""
+    change = sample.discount[:, None] * sample.x_next - sample.x
+    total: Floats = sample.reward + np.einsum("nd,nd->n", w, change)
+    return total
+
+
+def _expected_td(process: Process, options: Options) -> Expected:
+    A, b = td(process, options["lambda_"])
+    return flow(A + options["eta"] * np.eye(len(b)), b)
+
+
+def _expected_residual(process: Process, options: Options) -> Expected:
+    ahead = process.X - process.gamma * (process.P @ process.X)
+    back = process.D[:, None] * (process.X - options["phi"] * process.gamma * (process.P @ process.X))
+    return flow(back.T @ ahead, back.T @ process.r)
+
+
+def _expected_naive_residual(process: Process, options: Options) -> Expected:
+    return flow(*naive_residual(process))
+
+
+TD = Method(
+    "td", "TD(λ)", "Sutton 1988; with importance ratios Precup, Sutton & Singh 2000", {"lambda_": 0.0, "eta": 0.0},
+    _expected_td, _TD, remembers=lambda options: options["lambda_"] > 0,
+)  # fmt: skip
+RESIDUAL = Method(
+    "residual", "residual(φ), double-sampled", "Baird 1995", {"phi": 1.0}, _expected_residual, _Residual,
+    note="φ = 0 is TD(0), φ = 1 the residual gradient; needs two independent successors",
+)  # fmt: skip
+NAIVE_RESIDUAL = Method(
+    "naive-residual", "residual gradient, one sample", "Baird 1995; Sutton & Barto 2018, equation 11.23", {},
+    _expected_naive_residual, _NaiveResidual, note="descends the mean square TD error, not the Bellman error",
+)  # fmt: skip

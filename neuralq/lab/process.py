@@ -1,0 +1,240 @@
+"""A problem as the linear mathematics sees it: rows with features, two chains over them, and how often each is updated.
+
+The n rows are the states of a problem that learns V, or the legal pairs (s, a) of one that learns Q. Either way
+
+    P(i, j)      chance to go from row i to row j under the target policy, row discounts included, ends left out
+    P_mu(i, j)   the same under the behaviour policy
+    arc k        one way to go on under the behaviour: (row, next row or the end, chance, ratio, reward, discount)
+
+and the ratio of an arc is its chance under the target over that under the behaviour: π(a|s)/μ(a|s) between states and
+π(a'|s')/μ(a'|s') between pairs, whose own action is given. So a method that evaluates a policy is written once.
+Terminal states are no rows: entering one ends the episode, with a successor feature of 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from neuralq_envs.counterexamples import Problem
+
+__all__ = ["Arcs", "Process", "linear_process"]
+
+Floats = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LARGEST_DENSE = 2000
+"""Rows up to which chains are kept as dense arrays: beyond, products with sparse ones are cheaper and fit in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """Every way to go on that has a chance under the behaviour policy, sorted by row, ``[K]`` each.
+
+    Args:
+        row: where it starts.
+        next_row: where it leads; -1 where the episode ends.
+        probability: its chance given the row; those of a row sum to 1.
+        rho: importance ratio, chance under the target over ``probability``; 0 where the target never goes.
+        reward: expected reward of the action taken.
+        discount: γ, or 0 where the episode ends.
+        starts: arcs of row i are ``starts[i]:starts[i + 1]``, ``[n + 1]``.
+    """
+
+    row: Index
+    next_row: Index
+    probability: Floats
+    rho: Floats
+    reward: Floats
+    discount: Floats
+    starts: Index
+
+    @cached_property
+    def ladder(self) -> Floats:
+        """Row number plus the chance of this arc and of those before it in its row; uniform draws are looked up in it."""
+        total = np.cumsum(self.probability)
+        before = np.concatenate([[0.0], total])[self.starts[:-1]]
+        within = np.minimum(total - before[self.row], 1.0)
+        within[self.starts[1:] - 1] = 1.0  # whatever rounding left of the last arc's share
+        return np.asarray(self.row + within)
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """What the expected and the sampled updates of a problem are made of.
+
+    Args:
+        X: features of every row, ``[n, d]``.
+        P: target chain, ``[n, n]``, dense or sparse.
+        P_mu: behaviour chain, ``[n, n]``.
+        r: expected reward of every row under the target, ``[n]``.
+        r_mu: the same under the behaviour, ``[n]``.
+        D: how often each row is updated, ``[n]``, sums to 1.
+        start: where episodes begin, ``[n]``.
+        gamma: γ.
+        arcs: every way to go on under the behaviour.
+        target_arcs: every way to go on under the target.
+        pairs: state and action of every row where rows are pairs, ``[n, 2]``; None where they are states.
+        state: state of every row, ``[n]``.
+        target_policy: π(a|s) of the problem, ``[S, A]``.
+        behaviour_policy: μ(a|s), ``[S, A]``.
+        row_of: row of every pair, ``[S, A]``, -1 where it has none; None where rows are states.
+    """
+
+    X: Floats
+    P: Floats | sparse.csr_array
+    P_mu: Floats | sparse.csr_array
+    r: Floats
+    r_mu: Floats
+    D: Floats
+    start: Floats
+    gamma: float
+    arcs: Arcs
+    target_arcs: Arcs
+    pairs: Index | None
+    state: Index
+    target_policy: Floats
+    behaviour_policy: Floats
+    row_of: Index | None
+
+    @property
+    def num_rows(self) -> int:
+        """How many rows there are, n."""
+        return len(self.D)
+
+    @property
+    def num_weights(self) -> int:
+        """How many weights there are, d."""
+        return int(self.X.shape[1])
+
+    @cached_property
+    def v(self) -> Floats:
+        """The exact values of the target policy, (I − γP)⁻¹ r, ``[n]``."""
+        system = sparse.csc_array(sparse.eye_array(self.num_rows) - self.gamma * sparse.csr_array(self.P))
+        return np.asarray(splu(system).solve(self.r))
+
+    def with_features(self, X: Floats) -> Process:
+        """The same chains seen through other features, ``[n, d']``."""
+        return replace(self, X=X)
+
+    @cached_property
+    def visible(self) -> Floats:
+        """An orthonormal basis of the weights that some row sees, ``[d, rank X]``; others never matter to a value."""
+        _, singular, right = np.linalg.svd(self.X, full_matrices=False)
+        if len(singular) == 0 or singular[0] == 0:
+            return np.zeros((self.num_weights, 0))
+        kept: Floats = right[singular > 1e-12 * max(self.X.shape) * singular[0]].T
+        return kept
+
+
+def linear_process(problem: Problem) -> Process:
+    """A problem becomes rows, chains and arcs.
+
+    A row's discount below 1 counts as the chance that the episode goes on, as in simulation. Rewards are the expected
+    ones of each pair.
+
+    Example:
+        >>> from neuralq_envs.counterexamples import star
+        >>> process = linear_process(star())
+        >>> process.num_rows, len(process.arcs.row), process.visible.shape
+        (7, 49, (8, 7))
+        >>> sorted(set(process.arcs.rho.round(9).tolist()))  # dashed, solid
+        [0.0, 7.0]
+    """
+    return _of_pairs(problem) if problem.learns_q else _of_states(problem)
+
+
+def _of_states(problem: Problem) -> Process:
+    """Rows are the states that have actions."""
+    mdp = problem.mdp
+    lively = np.flatnonzero(~mdp.is_terminal)
+    number = np.full(mdp.num_states, -1, dtype=np.int64)
+    number[lively] = np.arange(len(lively))
+    arcs = {}
+    for name, policy in (("mu", problem.behaviour_policy), ("pi", problem.target_policy)):
+        chance = policy[mdp.s_tm1, mdp.a_tm1]
+        row, next_row, p, source = _go_on(problem, number, number[mdp.s_tm1], chance)
+        ratio = problem.importance_ratio[mdp.s_tm1[source], mdp.a_tm1[source]] if name == "mu" else np.ones(len(p))
+        arcs[name] = _arcs(problem, len(lively), row, next_row, p, ratio, mdp.reward[source])
+    return _assemble(problem, problem.features[lively], problem.state_distribution[lively],
+                     mdp.start_distribution[lively], arcs["mu"], arcs["pi"], None, lively, None)  # fmt: skip
+
+
+def _of_pairs(problem: Problem) -> Process:
+    """Rows are the legal pairs; a row goes on to s' by the model and from there to a' by the policy."""
+    mdp, n = problem.mdp, problem.mdp.num_rows
+    number = np.where(mdp.is_terminal, -1, np.arange(mdp.num_states))
+    row, s_next, p, source = _go_on(problem, number, np.arange(n), np.ones(n))
+    arcs = {}
+    for name, policy in (("mu", problem.behaviour_policy), ("pi", problem.target_policy)):
+        ended = s_next < 0
+        counts = np.where(ended, 1, np.diff(mdp.row_starts)[np.maximum(s_next, 0)])
+        index = np.repeat(np.arange(len(row)), counts)
+        offset = np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
+        next_row = np.where(ended[index], -1, mdp.row_starts[np.maximum(s_next[index], 0)] + offset)
+        here = (mdp.s_tm1[next_row], mdp.a_tm1[next_row])
+        chance = np.where(next_row < 0, 1.0, policy[here])
+        ratio = np.ones(len(index)) if name == "pi" else np.where(next_row < 0, 1.0, problem.importance_ratio[here])
+        kept = chance > 0
+        arcs[name] = _arcs(problem, n, row[index][kept], next_row[kept], (p[index] * chance)[kept], ratio[kept],
+                           mdp.reward[source[index]][kept])  # fmt: skip
+    pairs = np.stack([mdp.s_tm1, mdp.a_tm1], axis=1)
+    D = problem.state_distribution[mdp.s_tm1] * problem.behaviour_policy[mdp.s_tm1, mdp.a_tm1]
+    begin = mdp.start_distribution[mdp.s_tm1] * problem.behaviour_policy[mdp.s_tm1, mdp.a_tm1]
+    return _assemble(problem, problem.features[mdp.s_tm1, mdp.a_tm1], D, begin, arcs["mu"], arcs["pi"], pairs,
+                     mdp.s_tm1, mdp.row_index)  # fmt: skip
+
+
+def _go_on(problem: Problem, number: Index, row: Index, chance: Floats) -> tuple[Index, Index, Floats, Index]:
+    """Model rows spread over their successors, ends included: ``(row, next, probability, model row)`` of each arc.
+
+    Args:
+        problem: the problem.
+        number: what each state counts as, -1 for the end, ``[S]``.
+        row: what each model row starts from, ``[K]``.
+        chance: probability of each model row given its start, ``[K]``.
+    """
+    mdp = problem.mdp
+    flow = mdp.transition.tocoo()
+    source, successor = np.asarray(flow.coords[0], dtype=np.int64), number[np.asarray(flow.coords[1])]
+    p = flow.data * mdp.row_discount[source]
+    inside = successor >= 0
+    source, successor, p = source[inside], successor[inside], p[inside]
+    ended = 1.0 - np.bincount(source, weights=p, minlength=mdp.num_rows)
+    ends = np.flatnonzero(ended > 1e-12)
+    source = np.concatenate([source, ends])
+    successor = np.concatenate([successor, np.full(len(ends), -1)])
+    p = np.concatenate([p, ended[ends]]) * chance[source]
+    kept = p > 0
+    return row[source[kept]], successor[kept], p[kept], source[kept]
+
+
+def _arcs(problem: Problem, n: int, row: Index, next_row: Index, p: Floats, rho: Floats, reward: Floats) -> Arcs:
+    order = np.lexsort((next_row, row))
+    row, next_row = row[order], next_row[order]
+    discount = np.where(next_row < 0, 0.0, problem.gamma)
+    starts = np.searchsorted(row, np.arange(n + 1)).astype(np.int64)
+    return Arcs(row, next_row, p[order], rho[order], reward[order], discount, starts)
+
+
+def _assemble(
+    problem: Problem, X: Floats, D: Floats, start: Floats, arcs: Arcs, target_arcs: Arcs, pairs: Index | None,
+    state: Index, row_of: Index | None,
+) -> Process:  # fmt: skip
+    n = len(D)
+    chains, rewards = [], []
+    for one in (target_arcs, arcs):
+        inside = one.next_row >= 0
+        flow = (one.probability[inside], (one.row[inside], one.next_row[inside]))
+        chain = sparse.csr_array(sparse.coo_array(flow, shape=(n, n)))
+        chains.append(chain.toarray() if n <= LARGEST_DENSE else chain)
+        rewards.append(np.bincount(one.row, weights=one.probability * one.reward, minlength=n).astype(np.float64))
+    return Process(
+        np.array(X), chains[0], chains[1], rewards[0], rewards[1], D, start, problem.gamma, arcs, target_arcs, pairs,
+        state, problem.target_policy, problem.behaviour_policy, row_of,
+    )  # fmt: skip
