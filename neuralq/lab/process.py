@@ -56,7 +56,7 @@ class Arcs:
 
     @cached_property
     def ladder(self) -> Floats:
-        """Row number plus the chance of this arc and of those before it in its row; uniform draws are looked up in it."""
+        """Row number plus the chance of this arc and of those before it in its row, to look uniform draws up in."""
         total = np.cumsum(self.probability)
         before = np.concatenate([[0.0], total])[self.starts[:-1]]
         within = np.minimum(total - before[self.row], 1.0)

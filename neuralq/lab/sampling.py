@@ -116,7 +116,7 @@ def _features(process: Process, row: Index) -> Floats:
 
 def _draw(cumulative: Floats, u: Floats) -> Index:
     """Indices with the chances whose running sum is given; never one of chance 0."""
-    return np.searchsorted(cumulative, u * cumulative[-1], side="right").astype(np.int64)
+    return np.asarray(np.searchsorted(cumulative, u * cumulative[-1], side="right"), dtype=np.int64)
 
 
 def _climb(arcs: Arcs, row: Index, u: Floats) -> Index:
