@@ -1,15 +1,19 @@
 """Environments with a known answer: each gives its exact `FiniteMDP` beside the Gymnasium interface.
 
-`register` is the package's ``gymnasium.envs`` entry point, so ``gymnasium.make("neuralq/MitchellGrid-v0")`` finds them.
+Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`); those have no finite model. `register` is the
+package's ``gymnasium.envs`` entry point, so ``gymnasium.make("neuralq/MitchellGrid-v0")`` finds them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-__all__ = ["ENVIRONMENTS", "Registration", "register"]
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+
+__all__ = ["CLASSIC", "ENVIRONMENTS", "Classic", "Registration", "register", "vector_twin"]
 
 
 class Registration(NamedTuple):
@@ -46,6 +50,68 @@ ENVIRONMENTS = {
 }
 
 
+class Classic(NamedTuple):
+    """One of Gymnasium's own problems, with a vectorised implementation that repeats it to the bit.
+
+    Args:
+        entry_point: Gymnasium's class.
+        vector_entry_point: ours.
+        max_episode_steps: as Gymnasium registers it.
+        reward_threshold: as Gymnasium registers it.
+        arguments: of Gymnasium's class that the vectorised one knows too.
+    """
+
+    entry_point: str
+    vector_entry_point: str
+    max_episode_steps: int
+    reward_threshold: float
+    arguments: frozenset[str] = frozenset()
+
+
+CLASSIC = {
+    "neuralq/Acrobot-v0": Classic(
+        "gymnasium.envs.classic_control.acrobot:AcrobotEnv",
+        "neuralq_envs.classic:make_acrobot_vector",
+        max_episode_steps=500,
+        reward_threshold=-100.0,
+    ),
+    "neuralq/MountainCar-v0": Classic(
+        "gymnasium.envs.classic_control.mountain_car:MountainCarEnv",
+        "neuralq_envs.classic:make_mountain_car_vector",
+        max_episode_steps=200,
+        reward_threshold=-110.0,
+        arguments=frozenset({"goal_velocity"}),
+    ),
+}
+
+
+def vector_twin(spec: EnvSpec, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """The id and arguments with which ``gymnasium.make_vec`` makes the environments of ``spec``, only quicker, or None.
+
+    Gymnasium's ``MountainCar-v0`` and ``Acrobot-v1`` have one, and so has whatever else is registered with their
+    classes, with its own time limit. Wrappers and arguments that the vectorised one does not know rule it out.
+
+    Args:
+        spec: of the environment that is wanted.
+        given: arguments for ``gymnasium.make``.
+
+    Example:
+        >>> import gymnasium
+        >>> register()
+        >>> vector_twin(gymnasium.spec("Acrobot-v1"), {})
+        ('neuralq/Acrobot-v0', {'max_episode_steps': 500})
+        >>> vector_twin(gymnasium.spec("Acrobot-v1"), {"render_mode": "human"}) is None
+        True
+    """
+    arguments = {**spec.kwargs, **given}
+    limit = arguments.pop("max_episode_steps", None)
+    limit = spec.max_episode_steps if limit is None else limit
+    for env_id, one in CLASSIC.items():
+        if spec.entry_point == one.entry_point and not spec.additional_wrappers and one.arguments.issuperset(arguments):
+            return env_id, {**arguments, "max_episode_steps": None if limit == -1 else limit}
+    return None
+
+
 def register() -> None:
     """Registers every environment with Gymnasium; calling it again does nothing.
 
@@ -65,4 +131,13 @@ def register() -> None:
                 entry_point=f"{one.module}:make",
                 vector_entry_point=f"{one.module}:make_vector" if one.has_vector else None,
                 kwargs=dict(one.kwargs),
+            )
+    for env_id, classic in CLASSIC.items():
+        if env_id not in registration.registry:
+            registration.register(
+                env_id,
+                entry_point=classic.entry_point,
+                vector_entry_point=classic.vector_entry_point,
+                max_episode_steps=classic.max_episode_steps,
+                reward_threshold=classic.reward_threshold,
             )

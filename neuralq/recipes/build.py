@@ -33,6 +33,7 @@ from neuralq.rules import Linear
 from neuralq.snapshot import is_resumable
 from neuralq.training import Plan, Session, seed_for
 from neuralq.types import QFunction, Transition
+from neuralq_envs import vector_twin
 
 __all__ = ["build_q", "build_session", "make_envs", "plan_of"]
 
@@ -46,7 +47,8 @@ _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]]
 def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
     """Parallel environments: the registered vectorised implementation where there is one, else one after another.
 
-    A single environment is stepped directly, which is quicker than a batch of one.
+    Gymnasium's Mountain Car and Acrobot are vectorised by `neuralq_envs.classic`, which repeats them to the bit.
+    Elsewhere a single environment is stepped directly, which is quicker than a batch of one.
 
     Raises:
         ValueError: if the environment is not registered or cannot be made, with what to do about it.
@@ -56,6 +58,9 @@ def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
         if module:  # registers the environment
             importlib.import_module(module)
         spec = gym.spec(env_id)
+        twin = vector_twin(spec, config.env_kwargs)
+        if twin is not None:
+            return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
         if num_envs > 1 and spec.vector_entry_point is not None:
             return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
         return make_vector_env(lambda: gym.make(env_id, **config.env_kwargs), num_envs)
