@@ -14,27 +14,45 @@ On the subspace in which all upper states are equal, the expected update of the 
 and elsewhere the eigenvalue 4/(n+1). So expected TD(0) diverges at every step size iff γ > (n+9)/(2n+5): for n = 6 that
 is 15/17, for n ≤ 4 it never happens. The leading pair is complex, and the divergence swings, iff
 (n+9 − (2n+5)γ)² < 4(n+20)(1−γ); so for n = 5 and γ = .99.
+
+The cause is the mismatch of three things, and taking away any one of them cures the star: updating as often as the
+target policy visits (`star_on_policy`), a table (`star_tabular`), or less bootstrapping (`star_low_gamma`).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from neuralq.checks import check_whole
+from neuralq.checks import check_fraction, check_whole
 from neuralq.mdp import FiniteMDP
 from neuralq.simulate import ModelEnv, ModelVectorEnv
 from neuralq_envs.counterexamples.problem import Problem
 
-__all__ = ["DASHED", "SOLID", "critical_gamma", "make", "make_vector", "star"]
+__all__ = [
+    "DASHED",
+    "SOLID",
+    "critical_gamma",
+    "make",
+    "make_vector",
+    "star",
+    "star_1995",
+    "star_control",
+    "star_first_edition",
+    "star_low_gamma",
+    "star_on_policy",
+    "star_tabular",
+]
 
 DASHED, SOLID = 0, 1
 
 
-def star(num_upper: int = 6) -> Problem:
+def star(num_upper: int = 6, gamma: float = 0.99) -> Problem:
     """Baird's star with ``num_upper`` upper states; 6 gives the figure of Sutton & Barto 2018.
 
     Raises:
-        ValueError: fewer than one upper state.
+        ValueError: fewer than one upper state, or γ outside [0, 1].
 
     Example:
         >>> problem = star()
@@ -62,12 +80,178 @@ def star(num_upper: int = 6) -> Problem:
         behaviour_policy=np.tile([n / (n + 1), 1 / (n + 1)], (n + 1, 1)),
         state_distribution=np.full(n + 1, 1 / (n + 1)),
         initial_weights=weights,
-        gamma=0.99,
+        gamma=gamma,
         step_size=0.01,
         title="Baird's star",
         source="Baird 1995; Sutton & Barto 2018, section 11.2",
         known=f"Expected TD(0) diverges at every step size iff γ > (n + 9)/(2n + 5) = {critical_gamma(n):.4f}.",
     )
+
+
+def star_1995(num_upper: int = 5, gamma: float = 0.99) -> Problem:
+    """The star as Baird drew it: five upper states, one action, every transition trained equally often.
+
+    Raises:
+        ValueError: as `star`.
+
+    Example:
+        >>> problem = star_1995()
+        >>> problem.mdp.num_actions, problem.mdp.num_states
+        (1, 6)
+    """
+    problem = _one_action(star(num_upper, gamma), continuation=1.0)
+    return replace(
+        problem,
+        name="baird-1995",
+        title="Baird's star of 1995",
+        source="Baird 1995",
+        known=f"{problem.known} With n = 5 and γ = .99 the leading pair is complex: the values swing as they grow.",
+    )
+
+
+def star_first_edition(num_upper: int = 5, gamma: float = 0.99, termination: float = 0.01) -> Problem:
+    """The star in which the lower state ends the episode with a small probability.
+
+    Raises:
+        ValueError: as `star`, or ``termination`` outside [0, 1].
+
+    Example:
+        >>> star_first_edition().mdp.termination.round(12).tolist()
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.01]
+    """
+    check_fraction("termination", termination)
+    return replace(
+        _one_action(star(num_upper, gamma), continuation=1.0 - termination),
+        name="baird-first-edition",
+        title="Baird's star with an end",
+        source="Sutton & Barto 1998, figure 8.12",
+        known="An end with probability .01 does not help: expected TD(0) still diverges with n = 5 and γ = .99.",
+    )
+
+
+def star_control(num_upper: int = 6, gamma: float = 0.99, solid_probability: float | None = None) -> Problem:
+    """The star for Q-learning: Q(s, solid) has the features of the star, Q(s, dashed) a weight of its own.
+
+    Weight 0 is shared, weights 1 to n + 1 belong to ``solid`` in each state, the other n + 1 to ``dashed``. The target
+    is greedy. While ``solid`` is greedy everywhere, which holds on the whole way from the initial weights, the growing
+    mode is that of `star` slowed down by μ(solid).
+
+    Args:
+        num_upper: n.
+        gamma: γ.
+        solid_probability: μ(solid) in every state; None: 1 / (n + 1), as in `star`. One half makes all pairs equally
+            frequent.
+
+    Raises:
+        ValueError: as `star`, or ``solid_probability`` outside [0, 1].
+
+    Example:
+        >>> problem = star_control()
+        >>> problem.features.shape, (problem.features @ problem.initial_weights)[:, SOLID].tolist()
+        ((7, 2, 15), [3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 12.0])
+    """
+    problem = star(num_upper, gamma)
+    n = num_upper
+    solid = 1 / (n + 1) if solid_probability is None else solid_probability
+    check_fraction("solid_probability", solid)
+    features = np.zeros((n + 1, 2, 2 * n + 3))
+    features[:, SOLID, 0] = problem.features[:, n + 1]
+    features[:, SOLID, 1 : n + 2] = problem.features[:, : n + 1]
+    features[:, DASHED, n + 2 :] = np.eye(n + 1)
+    weights = np.ones(2 * n + 3)
+    weights[n + 1] = 10.0
+    uniform = solid_probability == 0.5
+    return replace(
+        problem,
+        name="baird-control-uniform" if uniform else "baird-control",
+        features=features,
+        initial_weights=weights,
+        behaviour_policy=np.tile([1 - solid, solid], (n + 1, 1)),
+        control=True,
+        title="Baird's star for Q-learning" + (", all pairs equally often" if uniform else ""),
+        source="Sutton & Barto 2018, exercise 11.3; features of Maei, Szepesvári, Bhatnagar & Sutton 2010",
+        known=f"While solid is greedy, as it stays from these weights at γ = .99, expected Q-learning diverges iff γ > "
+        f"(n + 9)/(2n + 5) = {critical_gamma(n):.4f}, {solid:.4g} times as fast as prediction does.",
+    )
+
+
+def star_on_policy(num_upper: int = 6, gamma: float = 0.99) -> Problem:
+    """The star updated where its target policy goes: always in the lower state.
+
+    Raises:
+        ValueError: as `star`.
+
+    Example:
+        >>> star_on_policy().state_distribution.tolist()
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    """
+    problem = star(num_upper, gamma)
+    return replace(
+        problem,
+        name="baird-on-policy",
+        behaviour_policy=problem.target_policy,
+        state_distribution=np.eye(num_upper + 1)[num_upper],
+        title="Baird's star, on-policy",
+        known="A has the one nonzero eigenvalue 5(1 − γ): expected TD(0) converges, slowly.",
+    )
+
+
+def star_tabular(num_upper: int = 6, gamma: float = 0.99) -> Problem:
+    """The star with one weight per state, which start at the values that the star's own features give.
+
+    Raises:
+        ValueError: as `star`.
+
+    Example:
+        >>> star_tabular().initial_weights.tolist()
+        [3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 12.0]
+    """
+    problem = star(num_upper, gamma)
+    return replace(
+        problem,
+        name="baird-tabular",
+        features=np.eye(num_upper + 1),
+        initial_weights=problem.features @ problem.initial_weights,
+        title="Baird's star in a table",
+        known="The eigenvalues of A are 1/(n + 1), n times, and (1 − γ)/(n + 1): TD(0) converges for every γ below 1.",
+    )
+
+
+def star_low_gamma(gamma: float = 0.85) -> Problem:
+    """The star of seven states with γ below 15/17 = .882, where expected TD(0) converges.
+
+    Raises:
+        ValueError: γ of 15/17 or more; use `star`.
+
+    Example:
+        >>> star_low_gamma().gamma
+        0.85
+    """
+    if gamma >= critical_gamma(6):
+        raise ValueError(f"gamma must lie below 15/17 = .882 for the star to converge, got {gamma}; use star(6, gamma)")
+    return replace(
+        star(6, gamma),
+        name="baird-low-gamma",
+        title="Baird's star with little bootstrapping",
+        known="γ < 15/17: expected TD(0) converges to values of 0.",
+    )
+
+
+def _one_action(problem: Problem, continuation: float) -> Problem:
+    """The target policy's moves as the only action, each state updated equally often; the lower state may end."""
+    size = problem.mdp.num_states
+    transition = np.zeros((size, size))
+    transition[:, -1] = 1.0
+    transition[-1, -1] = continuation
+    model = FiniteMDP.from_arrays(
+        [transition],
+        np.zeros((size, 1)),
+        substochastic=True,
+        state_names=problem.mdp.state_names,
+        action_names=("solid",),
+    )
+    only = np.ones((size, 1))
+    return replace(problem, mdp=model, target_policy=only, behaviour_policy=only)
 
 
 def critical_gamma(num_upper: int) -> float:
