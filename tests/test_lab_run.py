@@ -132,8 +132,8 @@ def test_streams_follow_the_model() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"method_name": "sarsa-2"}, "there is no method 'sarsa-2'"),
-        ({"phi": 0.5}, "td has no option 'phi'; it has lambda_, eta"),
+        ({"method": "sarsa-2"}, "there is no method 'sarsa-2'"),
+        ({"options": {"phi": 0.5}}, "td has no option 'phi'; it has lambda_, eta"),
         ({"num_seeds": 3}, "num_seeds must be 1"),
         ({"step_size": 0.0}, "step_size must be a finite number above 0"),
         ({"sampling": "on-policy"}, "sampling must be one of"),
@@ -142,6 +142,17 @@ def test_streams_follow_the_model() -> None:
 def test_mistakes_are_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         run(star(), **arguments)  # type: ignore[arg-type]
+
+
+def test_ratios_need_actions_that_are_tried() -> None:
+    mdp = FiniteMDP.garnet(3, 2, 2, seed=0)
+    never = np.tile([0.0, 1.0], (3, 1))
+    pairs = Problem.from_mdp(
+        mdp, np.eye(6).reshape(3, 2, 6), gamma=0.9, target_policy=1 - never, behaviour_policy=never
+    )
+    with pytest.raises(ValueError, match="never takes action 0 in state 0"):
+        run(pairs, "td", 10, sampling="iid")
+    assert np.isfinite(run(pairs, "expected-sarsa", 10, sampling="iid").weights).all()
 
 
 def test_every_method_has_a_name_of_its_own() -> None:

@@ -19,14 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from neuralq.checks import check_choice, check_positive, check_whole
-from neuralq.lab.methods import Expected, Method, method
+from neuralq.lab.methods import Expected, Method
+from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Options, Piece
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.process import Process, linear_process
 from neuralq.lab.sampling import Sampling, stream
 from neuralq_envs.counterexamples import Problem
 
-__all__ = ["CAP", "Run", "affine_power", "run"]
+__all__ = ["CAP", "Run", "affine_power", "check_coverage", "run"]
 
 Floats = NDArray[np.float64]
 
@@ -53,6 +54,7 @@ class Run:
         weights: w of every seed at the end, or the last that was below the cap, ``[N, d]``.
         stopped_at: update at which a seed had passed the cap, -1 where it never did, ``[N]``.
         cap: largest entry of the weights that is not called divergence.
+        path: w of the first seed at the recorded updates, ``[R, d]``; it stays where it was before it passed the cap.
     """
 
     problem: str
@@ -66,6 +68,7 @@ class Run:
     weights: Floats
     stopped_at: NDArray[np.int64]
     cap: float
+    path: Floats
 
     @property
     def diverged(self) -> NDArray[np.bool_]:
@@ -102,26 +105,26 @@ class Run:
 
 def run(
     problem: Problem,
-    method_name: str = "td",
+    method: str = "td",
     num_steps: int = 1000,
     step_size: float | None = None,
     sampling: Sampling = "expected",
     num_seeds: int = 1,
     seed: int = 0,
-    **method_options: float,
+    options: Options | None = None,
 ) -> Run:
     """A method trained on a problem.
 
     Args:
         problem: what to learn.
-        method_name: one of `neuralq.lab.methods.METHODS`.
+        method: one of `neuralq.lab.methods.METHODS`.
         num_steps: updates.
         step_size: α; the problem's own by default.
         sampling: ``"expected"`` (one deterministic run, every row updated at once with its weight), ``"iid"`` (rows
             drawn from D) or ``"markov"`` (chains that follow the behaviour policy).
         num_seeds: independent runs; 1 for ``"expected"``.
         seed: of all of them.
-        method_options: of the method, by name.
+        options: of the method, by name, such as ``{"lambda_": 0.9}``.
 
     Raises:
         ValueError: an argument out of range, an unknown method or option, or a method that has no such update.
@@ -137,8 +140,8 @@ def run(
     check_choice("sampling", sampling, ("expected", "iid", "markov"))
     alpha = problem.step_size if step_size is None else step_size
     check_positive("step_size", alpha)
-    chosen = method(method_name)
-    options = chosen.checked(method_options)
+    chosen = method_named(method)
+    given = chosen.checked(options or {})
     process = linear_process(problem)
     with threadpool_limits(limits=1), np.errstate(over="ignore", invalid="ignore"):
         if sampling == "expected":
@@ -146,9 +149,27 @@ def run(
                 raise ValueError(
                     f"the expected update is the same for every seed: num_seeds must be 1, got {num_seeds}"
                 )
-            return _expected_run(problem, process, chosen, options, num_steps, alpha)
+            return _expected_run(problem, process, chosen, given, num_steps, alpha)
         rng = np.random.default_rng(seed)
-        return _sampled_run(problem, process, chosen, options, num_steps, alpha, sampling, num_seeds, rng)
+        return _sampled_run(problem, process, chosen, given, num_steps, alpha, sampling, num_seeds, rng)
+
+
+def check_coverage(problem: Problem, chosen: Method) -> None:
+    """The behaviour policy tries every action that the importance ratios of a method need.
+
+    Methods for pairs that look at all actions of the next state need no ratio for it.
+
+    Raises:
+        ValueError: an action that the target takes and the behaviour never does.
+    """
+    mdp = problem.mdp
+    missing = np.argwhere((problem.behaviour_policy == 0) & (problem.target_policy > 0) & mdp.legal)
+    if chosen.rows == "any" and missing.size:
+        s, a = missing[0]
+        raise ValueError(
+            f"{chosen.title} weighs actions by importance ratios, but the behaviour policy never takes action {a} in "
+            f"{mdp.state_name(s)}, which the target policy takes; use a method for pairs, such as expected-sarsa or gq"
+        )
 
 
 def affine_power(piece: Piece, k: int) -> Piece:
@@ -195,6 +216,7 @@ class _Record:
         self.steps: list[int] = []
         self.rmsve: list[Floats] = []
         self.rmspbe: list[Floats] = []
+        self.path: list[Floats] = []
         self.stopped_at = np.full(len(w), -1, dtype=np.int64)
         self.weights = w.copy()
         self.add(0, w)
@@ -208,6 +230,7 @@ class _Record:
     def add(self, step: int, w: Floats) -> None:
         alive = self.stopped_at < 0
         self.weights[alive] = w[alive]
+        self.path.append(self.weights[0].copy())
         self.steps.append(step)
         for rows, error in zip((self.rmsve, self.rmspbe), self._errors(w), strict=True):
             rows.append(np.where(alive, np.minimum(error, self.cap), self.cap))
@@ -216,6 +239,7 @@ class _Record:
         return Run(
             problem.name, chosen.name, options, sampling, alpha, np.array(self.steps, dtype=np.int64),
             np.array(self.rmsve), np.array(self.rmspbe), self.weights, self.stopped_at, self.cap,
+            np.array(self.path),
         )  # fmt: skip
 
 
@@ -224,7 +248,7 @@ def _record_steps(num_steps: int) -> list[int]:
     if num_steps <= _MOST_RECORDS:
         return list(range(1, num_steps + 1))
     spread = np.linspace(0, num_steps, _MOST_RECORDS + 1)[1:].round().astype(int)
-    return sorted({1, 2, 5, 10, 20, 50, 100, *spread.tolist()} & set(range(1, num_steps + 1)))
+    return sorted({1, 2, 5, 10, 20, 50, 100, *spread.tolist()})
 
 
 def _expected_run(
@@ -273,6 +297,7 @@ def _sampled_run(
     assert sampling != "expected"
     if chosen.learner is None:
         raise ValueError(f"{chosen.title} has no update from single transitions; use sampling='expected'")
+    check_coverage(problem, chosen)
     w0 = np.tile(problem.initial_weights, (num_seeds, 1))
     learner = chosen.learner(process, w0, options)
     record = _Record(process, learner.theta[:, : process.num_weights])

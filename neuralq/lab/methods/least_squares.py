@@ -1,0 +1,224 @@
+"""Methods that solve for the weights instead of stepping towards them.
+
+    LSTD(λ)    w = A_λ⁺ b_λ,   Â += z (x − γx')ᵀ,  b̂ += r z        right even where TD diverges, if A is invertible
+    BRM        w = argmin ‖r + γPXw − Xw‖_D                        the residual gradient's limit, from two successors
+    fitted     w ← (C + ηI)⁺ Xᵀ D (r + γPXw)                       M = (C + ηI)⁺ H: may diverge, no step size helps
+    fitted-q   the same with max_a' Q(s', a') for the backup        piecewise
+    LSPI       w ← the LSTD solution for the policy greedy in w      piecewise; may cycle among policies for ever
+
+None of these maps depends on α. ⁺ is the pseudo-inverse, so of many solutions the one of least norm is meant. With
+fitted iteration on Xw every sweep is a regression: a hard target network whose period is infinite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuralq.checks import check_fraction, check_whole
+from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
+from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
+from neuralq.lab.methods.operators import covariance, cross, td
+from neuralq.lab.process import Process
+from neuralq.lab.sampling import Sample
+
+__all__ = ["BRM", "FITTED", "FITTED_Q", "LSPI", "LSTD", "PolicyIteration", "lspi"]
+
+NEGLIGIBLE = 1e-10
+"""Singular values below this share of the largest count as 0 in a pseudo-inverse."""
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyIteration:
+    """Where least-squares policy iteration went.
+
+    Args:
+        weights: the first weights and those after every evaluation, ``[K + 1, d]``.
+        policies: the greedy action of every state at each of them, ``[K + 1, S]``.
+        cycle: 1 where the last policy repeats for ever (it converged), a larger number where the last so many policies
+            repeat in turn, 0 where neither was seen within the iterations allowed.
+    """
+
+    weights: Floats
+    policies: NDArray[np.int64]
+    cycle: int
+
+
+def lspi(process: Process, w0: Floats, num_iterations: int = 100) -> PolicyIteration:
+    """Policy iteration whose evaluation is LSTD on the process's own features and update distribution.
+
+    Args:
+        process: of pairs.
+        w0: ``[d]``; the first policy is greedy in it.
+        num_iterations: at most so many evaluations.
+
+    Raises:
+        ValueError: rows are states.
+
+    Source: Lagoudakis & Parr 2003.
+
+    Example:
+        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.mdp import FiniteMDP
+        >>> from neuralq_envs.counterexamples import Problem
+        >>> mdp = FiniteMDP.garnet(5, 2, 2, seed=0)
+        >>> table = np.eye(10).reshape(5, 2, 10)
+        >>> lspi(linear_process(Problem.from_mdp(mdp, table, gamma=0.9)), np.zeros(10)).cycle  # a table converges
+        1
+    """
+    row_of = pairs_of(process, "lspi")
+    check_whole("num_iterations", num_iterations)
+    weights: list[Floats] = [w0.copy()]
+    policies: list[NDArray[np.int64]] = []
+    seen: dict[bytes, int] = {}
+    for k in range(num_iterations + 1):
+        policy = greedy_policy(process, row_of, weights[-1])
+        policies.append(policy.argmax(axis=1))
+        key = policies[-1].tobytes()
+        if key in seen:
+            return PolicyIteration(np.array(weights), np.array(policies), k - seen[key])
+        seen[key] = k
+        if k < num_iterations:
+            weights.append(_solution(process, chain_of(process, row_of, policy)))
+    return PolicyIteration(np.array(weights), np.array(policies), 0)
+
+
+class _Solver:
+    """Sums of matrices and vectors for every seed, solved when the weights are asked for."""
+
+    def __init__(self, w0: Floats, eta: float) -> None:
+        num_seeds, d = w0.shape
+        self._matrix = np.zeros((num_seeds, d, d))
+        self._vector = np.zeros((num_seeds, d))
+        self._eta, self._count = eta, 0
+        self._theta, self._stale = w0.copy(), False
+
+    def add(self, left: Floats, right: Floats, reward: Floats) -> None:
+        self._matrix += left[:, :, None] * right[:, None, :]
+        self._vector += reward[:, None] * left
+        self._count += 1
+        self._stale = True
+
+    @property
+    def theta(self) -> Floats:
+        """What the sums so far say, ``[N, d]``; the first weights before there are any."""
+        if self._stale:
+            ridge = self._eta * np.eye(self._matrix.shape[-1])
+            inverse = np.linalg.pinv(self._matrix / self._count + ridge, rcond=NEGLIGIBLE)
+            self._theta = np.einsum("nij,nj->ni", inverse, self._vector / self._count)
+            self._stale = False
+        return self._theta
+
+    @theta.setter
+    def theta(self, value: Floats) -> None:
+        self._theta, self._stale = value, False
+
+
+class _LSTD(_Solver):
+    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
+        super().__init__(w0, options["eta"])
+        self._lambda = options["lambda_"]
+        check_fraction("lambda_", self._lambda)
+        self._z = np.zeros_like(w0)
+        self._decay = np.zeros(len(w0))
+
+    def update(self, sample: Sample, step_size: float) -> None:
+        decay = np.where(sample.begins, 0.0, self._decay)
+        self._z = sample.rho[:, None] * (decay[:, None] * self._z + sample.x)
+        self.add(self._z, sample.x - sample.discount[:, None] * sample.x_next, sample.reward)
+        self._decay = sample.discount * self._lambda
+
+
+class _BRM(_Solver):
+    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
+        super().__init__(w0, options["eta"])
+
+    def update(self, sample: Sample, step_size: float) -> None:
+        left = sample.rho[:, None] * (sample.x - sample.discount_second[:, None] * sample.x_second)
+        self.add(left, sample.x - sample.discount[:, None] * sample.x_next, sample.reward)
+
+
+def _pinv(matrix: Floats) -> Floats:
+    return np.asarray(np.linalg.pinv(matrix, rcond=NEGLIGIBLE))
+
+
+def _solution(process: Process, P: Floats | object) -> Floats:
+    """The LSTD(0) weights for another chain."""
+    ahead = process.X - process.gamma * (P @ process.X)  # type: ignore[operator]
+    back = process.D[:, None] * process.X
+    weights: Floats = _pinv(back.T @ ahead) @ (back.T @ process.r)
+    return weights
+
+
+def _constant(w: Floats) -> Expected:
+    """θ ← w, whatever θ was."""
+    return Expected(len(w), lambda theta, step_size: (np.zeros((len(w), len(w))), w.copy()))
+
+
+def _expected_lstd(process: Process, options: Options) -> Expected:
+    A, b = td(process, options["lambda_"])
+    return _constant(_pinv(A + options["eta"] * np.eye(len(b))) @ b)
+
+
+def _expected_brm(process: Process, options: Options) -> Expected:
+    ahead = process.X - process.gamma * (process.P @ process.X)
+    back = process.D[:, None] * ahead
+    return _constant(_pinv(back.T @ ahead + options["eta"] * np.eye(process.num_weights)) @ (back.T @ process.r))
+
+
+def _regression(process: Process, eta: float) -> Floats:
+    return _pinv(covariance(process) + eta * np.eye(process.num_weights))
+
+
+def _expected_fitted(process: Process, options: Options) -> Expected:
+    inverse = _regression(process, options["eta"])
+    M, c = inverse @ cross(process), inverse @ (process.X.T @ (process.D * process.r))
+    return Expected(len(c), lambda theta, step_size: (M.copy(), c.copy()))
+
+
+def _expected_fitted_q(process: Process, options: Options) -> Expected:
+    row_of = pairs_of(process, "fitted-q")
+    inverse, back = _regression(process, options["eta"]), process.D[:, None] * process.X
+    c = inverse @ (back.T @ process.r)
+
+    def at(theta: Floats, step_size: float) -> Piece:
+        P = chain_of(process, row_of, greedy_policy(process, row_of, theta))
+        return inverse @ (process.gamma * (back.T @ (P @ process.X))), c.copy()
+
+    return Expected(len(c), at, linear=False)
+
+
+def _expected_lspi(process: Process, options: Options) -> Expected:
+    row_of, d = pairs_of(process, "lspi"), process.num_weights
+
+    def at(theta: Floats, step_size: float) -> Piece:
+        policy = greedy_policy(process, row_of, theta)
+        return np.zeros((d, d)), _solution(process, chain_of(process, row_of, policy))
+
+    return Expected(d, at, linear=False)
+
+
+LSTD = Method(
+    "lstd", "LSTD(λ)", "Bradtke & Barto 1996; Boyan 2002; off-policy Yu 2010", {"lambda_": 0.0, "eta": 0.0},
+    _expected_lstd, _LSTD, remembers=lambda options: True,
+    note="has no step size; its sampled weights solve the averages of all transitions so far, plus η",
+)  # fmt: skip
+BRM = Method(
+    "brm", "Bellman residual minimisation", "Schweitzer & Seidmann 1985; Baird 1995; Lagoudakis & Parr 2003",
+    {"eta": 0.0}, _expected_brm, _BRM, remembers=lambda options: True,
+    note="has no step size; needs two independent successors",
+)  # fmt: skip
+FITTED = Method(
+    "fitted", "fitted iteration, least squares", "Gordon 1995; Tsitsiklis & Van Roy 1996",
+    {"eta": 0.0}, _expected_fitted, None, note="has no step size: one sweep is one regression",
+)  # fmt: skip
+FITTED_Q = Method(
+    "fitted-q", "fitted Q iteration, least squares", "Gordon 1995; Ernst, Geurts & Wehenkel 2005", {"eta": 0.0},
+    _expected_fitted_q, None, rows="pairs", note="backs up the greedy action: piecewise linear, and has no step size",
+)  # fmt: skip
+LSPI = Method(
+    "lspi", "LSPI", "Lagoudakis & Parr 2003", {}, _expected_lspi, None, rows="pairs",
+    note="one sweep is one evaluation and one improvement; it may cycle among policies",
+)  # fmt: skip
