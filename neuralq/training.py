@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -29,11 +29,27 @@ from neuralq.record import RunFolder
 from neuralq.snapshot import Resumability, encode_env, restore_env
 from neuralq.types import Transition
 
-__all__ = ["Diverged", "Hook", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
+__all__ = ["Diverged", "Hook", "Onlooker", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
 
 
 class Hook(Protocol):
     """Takes every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
+
+    def __call__(self, row: Mapping[str, Any], /) -> None:
+        """Take in one row."""
+        ...
+
+
+@runtime_checkable
+class Onlooker(Protocol):
+    """A hook that also looks at the learner: what was last learned from is shown to it before each row.
+
+    It reads, never writes: neither the learner nor the sample, of which it copies what it wants to keep.
+    """
+
+    def look(self, learner: Learner, sample: Sample, /) -> None:
+        """Read the learner and the sample it last learned from."""
+        ...
 
     def __call__(self, row: Mapping[str, Any], /) -> None:
         """Take in one row."""
@@ -210,6 +226,7 @@ class _Loop:
         self.session, self.plan, self.progress, self.folder, self.hooks = session, plan, progress, folder, hooks
         self.recent = deque(progress.recent_returns, maxlen=100)
         self.last_update: Update | None = None
+        self.last_sample: Sample | None = None
         self.device = session.learner.engine.flat.values.device
         self._reset_clock()
         self._log_clock = (progress.env_steps, time.perf_counter())
@@ -263,7 +280,7 @@ class _Loop:
         for sample in session.feed.draw():
             update = session.learner.update(*self._on_device(sample))
             session.feed.return_errors(sample, update.errors)
-            self.last_update = update
+            self.last_update, self.last_sample = update, sample
         self.progress.env_steps = session.stream.num_steps
 
     def _on_device(self, sample: Sample) -> tuple[Transition, Tensor | None]:
@@ -276,7 +293,10 @@ class _Loop:
     def _record(self, row: dict[str, Any]) -> None:
         self.folder.append_metrics(row)
         for hook in self.hooks:
+            if self.last_sample is not None and isinstance(hook, Onlooker):
+                hook.look(self.session.learner, self.last_sample)
             hook(row)
+        self._stop_clock(training=False)  # whoever watches costs wall time only
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed."""

@@ -1,16 +1,21 @@
 """The expected semi-gradient update of any representation, and how it grows where it stands.
 
-All pairs (s, a) are updated at once, each with weight d(s) μ(a|s) ρ(s, a), ρ = π/μ, towards its expected target:
+All cells are updated at once, each with its weight w, towards its expected target. A cell is a pair (s, a), or a state
+where the representation has one output:
 
     δ(s, a) = r(s, a) + γ Σ_{s'} P(s'|s, a) Σ_{a'} π(a'|s') Q(s', a') − Q(s, a)
-    F(θ) = Σ_{s,a} d(s) μ(a|s) ρ(s, a) δ(s, a) ∇Q(s, a),    θ ← θ + α F(θ)            (semi-gradient: δ is a constant)
+    F(θ) = Σ_{s,a} w(s, a) δ(s, a) ∇Q(s, a),    θ ← θ + α F(θ)            (semi-gradient: δ is a constant)
+
+Where a problem is about state values, w(s, a) = d(s) μ(a|s) ρ(s, a) with ρ = π/μ; where it is about Q, w = d(s) μ(a|s),
+for a pair needs no ratio for its own action. In control π is greedy in the present Q, ties going to the lowest action.
+Terminal states are worth 0 whatever the representation says of them.
 
 The sweep is synchronous: every target is computed before anything moves. For a table or linear features F is linear and
 `neuralq.exact.predict_expected_td` says all there is to say. For a network ∂F/∂θ depends on θ; it is
 
-    ∂F/∂θ = Σ w(s, a) [ ∇Q ∇δᵀ + δ ∇²Q ],
+    G = ∂F/∂θ = Σ w(s, a) [ ∇Q ∇δᵀ + δ ∇²Q ],
 
-the second term being absent from the neural tangent kernel. `local_growth` takes both.
+the second term being absent from the neural tangent kernel. `local_jacobian` and `local_growth` take both.
 """
 
 from __future__ import annotations
@@ -19,12 +24,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from neuralq.checks import check_positive
+from neuralq.exact import policy_process
 from neuralq_envs.counterexamples import Problem
 
-__all__ = ["ExpectedBackup", "QModule", "expected_backup", "expected_td_step", "local_growth"]
+__all__ = ["ExpectedBackup", "QModule", "expected_backup", "expected_td_step", "local_growth", "local_jacobian"]
 
 QModule = nn.Module  # with `all` and `at`: a module that is a `neuralq.types.QFunction`
 
@@ -33,13 +40,18 @@ QModule = nn.Module  # with `all` and `at`: a module that is a `neuralq.types.QF
 class ExpectedBackup:
     """The numbers of a counterexample as tensors, with what the representation sees of each state.
 
+    A is the number of the representation's outputs: the model's actions, or 1 for state values.
+
     Args:
         observations: one row per state, ``[S, *obs]``.
-        weights: d(s) μ(a|s) ρ(s, a), ``[S, A]``.
+        weights: how often each cell is updated, ratio included, ``[S, A]``.
         rewards: r(s, a), ``[S, A]``.
         transitions: P(s'|s, a), ``[S, A, S]``, row discounts included.
-        target_policy: π(a|s), ``[S, A]``.
+        target_policy: π(a|s), ``[S, A]``; 0 in a terminal state, which is worth nothing.
         gamma: γ.
+        legal: which actions exist, ``[S, A]``, bool; none in a terminal state.
+        greedy: whether the target policy is greedy in the present Q instead.
+        exploration: ε of a behaviour that is ε-greedy in the present Q; None: ``weights`` stay.
     """
 
     observations: Tensor
@@ -48,47 +60,97 @@ class ExpectedBackup:
     transitions: Tensor
     target_policy: Tensor
     gamma: float
+    legal: Tensor
+    greedy: bool = False
+    exploration: float | None = None
+
+    def policy(self, q: Tensor) -> Tensor:
+        """The target policy at these values, ``[S, A] -> [S, A]``; rows of terminal states are 0."""
+        if self.greedy:
+            return self._greedy(q)
+        return self.target_policy if self.exploration is None else self._exploring(q, self.exploration)
+
+    def update_weights(self, q: Tensor) -> Tensor:
+        """How often each cell is updated at these values, ``[S, A] -> [S, A]``."""
+        if self.exploration is None:
+            return self.weights
+        return self.weights.sum(-1, keepdim=True) * self._exploring(q, self.exploration)
 
     def state_values(self, q: Tensor) -> Tensor:
-        """V(s) = Σ_a π(a|s) Q(s, a), ``[S, A] -> [S]``."""
-        return (self.target_policy * q).sum(-1)
+        """V(s) = Σ_a π(a|s) Q(s, a), ``[S, A] -> [S]``; 0 in a terminal state."""
+        pi = self.policy(q)
+        return (pi * q.masked_fill(pi == 0, 0.0)).sum(-1)  # a masked action is worth −∞, and 0 · −∞ is not 0
 
     def errors(self, q: Tensor) -> Tensor:
-        """δ(s, a) of every pair, ``[S, A] -> [S, A]``."""
-        return self.rewards + self.gamma * (self.transitions @ self.state_values(q)) - q
+        """δ(s, a) of every cell, ``[S, A] -> [S, A]``; 0 where no action exists."""
+        delta = self.rewards + self.gamma * (self.transitions @ self.state_values(q)) - q
+        return delta.masked_fill(~self.legal, 0.0)
+
+    def _greedy(self, q: Tensor) -> Tensor:
+        best = q.detach().masked_fill(~self.legal, -torch.inf).argmax(-1)  # the lowest of several
+        return nn.functional.one_hot(best, q.shape[-1]).to(q.dtype) * self.legal
+
+    def _exploring(self, q: Tensor, epsilon: float) -> Tensor:
+        uniform = self.legal / self.legal.sum(-1, keepdim=True).clamp(min=1)
+        return (1 - epsilon) * self._greedy(q) + epsilon * uniform.to(q.dtype)
 
 
-def expected_backup(problem: Problem, observations: Tensor) -> ExpectedBackup:
+def expected_backup(problem: Problem, observations: Tensor, *, state_values: bool = False) -> ExpectedBackup:
     """A counterexample becomes tensors for a representation that sees ``observations`` (one row per state).
 
+    Args:
+        problem: states, policies and how often each state is updated.
+        observations: ``[S, *obs]``.
+        state_values: whether the representation has one output, V(s), instead of one per action.
+
     Raises:
-        ValueError: another number of observations than states.
+        ValueError: another number of observations than states, or state values of a problem about Q.
 
     Example:
         >>> from neuralq_envs.counterexamples import star
         >>> expected_backup(star(), torch.arange(7)).weights[0].tolist()  # a dashed pair does not count
         [0.0, 0.14285714285714285]
+        >>> expected_backup(star(), torch.arange(7), state_values=True).weights[0].tolist()
+        [0.14285714285714285]
     """
     model = problem.mdp
-    shape = (model.num_states, model.num_actions)
     if len(observations) != model.num_states:
         raise ValueError(
             f"observations must have one row for each of {model.num_states} states, got {len(observations)}"
         )
+    arrays = _state_arrays(problem) if state_values else _pair_arrays(problem)
+    weights, rewards, transitions, policy, legal = (torch.from_numpy(np.ascontiguousarray(x)) for x in arrays)
+    return ExpectedBackup(
+        observations, weights, rewards, transitions, policy * legal, problem.gamma, legal, problem.control,
+        problem.exploration,
+    )  # fmt: skip
+
+
+def _state_arrays(problem: Problem) -> tuple[NDArray[np.generic], ...]:
+    if problem.learns_q:
+        raise ValueError(
+            "this problem has features of state-action pairs: give the representation one output per action"
+        )
+    P_pi, r_pi = policy_process(problem.mdp, problem.target_policy)
+    lively = ~problem.mdp.is_terminal[:, None]
+    return (
+        problem.state_distribution[:, None].copy(), r_pi[:, None], P_pi.toarray()[:, None, :],
+        np.ones_like(lively, dtype=np.float64), lively,
+    )  # fmt: skip
+
+
+def _pair_arrays(problem: Problem) -> tuple[NDArray[np.generic], ...]:
+    model = problem.mdp
+    shape = (model.num_states, model.num_actions)
     transitions = np.zeros((*shape, model.num_states))
     transitions[model.s_tm1, model.a_tm1] = model.row_discount[:, None] * model.transition.toarray()
     rewards = np.zeros(shape)
     rewards[model.s_tm1, model.a_tm1] = model.reward
-    ratio = problem.importance_ratio
-    weights = problem.state_distribution[:, None] * problem.behaviour_policy * ratio
-    return ExpectedBackup(
-        observations,
-        torch.from_numpy(weights),
-        torch.from_numpy(rewards),
-        torch.from_numpy(transitions),
-        torch.tensor(problem.target_policy),
-        problem.gamma,
-    )
+    legal = model.legal.copy()
+    weights = problem.state_distribution[:, None] * problem.behaviour_policy
+    if not problem.learns_q:
+        weights = weights * problem.importance_ratio
+    return np.where(legal, weights, 0.0), rewards, transitions, problem.target_policy.copy(), legal
 
 
 def expected_td_step(q: QModule, backup: ExpectedBackup, step_size: float) -> Tensor:
@@ -114,11 +176,41 @@ def expected_td_step(q: QModule, backup: ExpectedBackup, step_size: float) -> Te
     parameters = list(q.parameters())
     values: Tensor = q.all(backup.observations)  # type: ignore[operator]
     before = values.detach()
-    directions = torch.autograd.grad(values, parameters, grad_outputs=backup.weights * backup.errors(before))
+    pull = backup.update_weights(before) * backup.errors(before)
+    directions = torch.autograd.grad(values, parameters, grad_outputs=pull)
     with torch.no_grad():
         for parameter, direction in zip(parameters, directions, strict=True):
             parameter.add_(direction, alpha=step_size)
     return before
+
+
+def local_jacobian(q: QModule, backup: ExpectedBackup) -> NDArray[np.float64]:
+    """G = ∂F/∂θ at the present weights, ``[p, p]``: how a small change of the weights changes the expected update.
+
+    It is the whole derivative, G = −Jᵀ D (I − γP) J + Σ w δ ∇²Q, with J = ∂Q/∂θ and D = diag(w).
+
+    Args:
+        q: the representation, with at most some thousand parameters.
+        backup: from `expected_backup`.
+
+    Example:
+        >>> from neuralq.q import LinearQ
+        >>> from neuralq_envs.counterexamples import star
+        >>> backup = expected_backup(star(), torch.tensor(star().features), state_values=True)
+        >>> round(float(np.linalg.eigvals(local_jacobian(LinearQ(8, 1), backup)).real.max()), 6)
+        0.23925
+    """
+    parameters = list(q.parameters())
+    values: Tensor = q.all(backup.observations)  # type: ignore[operator]
+    # F keeps its graph through the errors as well as through ∇Q, so its derivative is the full one.
+    wide = values.double()
+    pull = (backup.update_weights(wide.detach()) * backup.errors(wide)).to(values.dtype)
+    parts = torch.autograd.grad(values, parameters, grad_outputs=pull, create_graph=True)
+    update = torch.cat([part.reshape(-1) for part in parts])
+    rows = torch.autograd.grad(update, parameters, grad_outputs=torch.eye(len(update), dtype=update.dtype),
+                               is_grads_batched=True, materialize_grads=True)  # fmt: skip
+    jacobian: NDArray[np.float64] = torch.cat([row.reshape(len(update), -1) for row in rows], dim=1).double().numpy()
+    return jacobian
 
 
 def local_growth(q: QModule, backup: ExpectedBackup, step_size: float) -> float:
@@ -139,15 +231,6 @@ def local_growth(q: QModule, backup: ExpectedBackup, step_size: float) -> float:
         0.999
     """
     check_positive("step_size", step_size)
-    parameters = list(q.parameters())
-    values: Tensor = q.all(backup.observations)  # type: ignore[operator]
-    # F keeps its graph through the errors as well as through ∇Q, so its derivative is the full one.
-    pull = backup.weights * backup.errors(values)
-    parts = torch.autograd.grad(values, parameters, grad_outputs=pull, create_graph=True)
-    update = torch.cat([part.reshape(-1) for part in parts])
-    rows = torch.autograd.grad(update, parameters, grad_outputs=torch.eye(len(update), dtype=update.dtype),
-                               is_grads_batched=True, materialize_grads=True)  # fmt: skip
-    jacobian = torch.cat([row.reshape(len(update), -1) for row in rows], dim=1).numpy()
-    eigenvalues = np.linalg.eigvals(jacobian)
+    eigenvalues = np.linalg.eigvals(local_jacobian(q, backup))
     moving = eigenvalues[np.abs(eigenvalues) > 1e-10 * np.abs(eigenvalues).max(initial=0.0)]
     return float(np.abs(1 + step_size * moving).max(initial=0.0))
