@@ -4,22 +4,40 @@ Each has ``update(transition, weight) -> Update``, ``state_dict()`` and ``load_s
 library, what is held fixed when a gradient is taken. `RolloutLearner` uses the forward view of TD(λ) over rollouts,
 `ReplayLearner` stored transitions or blocks of them, `OnlineLearner` and `PredictionLearner` the backward view with
 eligibility traces, one step at a time.
+
+Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
+`GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 """
 
 from neuralq.learners.batch import ReplayLearner, ReplaySettings
+from neuralq.learners.correction import HeadCorrection, TangentCorrection
+from neuralq.learners.dqrc import DQRCLearner, DQRCSettings, TwinHead
+from neuralq.learners.gradient_step import GradientTDSettings
+from neuralq.learners.gradient_td import GradientPredictionLearner, GradientQLearner
 from neuralq.learners.online import OnlineLearner, OnlineSettings, PredictionLearner
+from neuralq.learners.residual_gradient import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
 from neuralq.learners.update import Descent, Learner, Update
 
 __all__ = [
+    "DQRCLearner",
+    "DQRCSettings",
     "Descent",
+    "GradientPredictionLearner",
+    "GradientQLearner",
+    "GradientTDSettings",
+    "HeadCorrection",
     "Learner",
     "OnlineLearner",
     "OnlineSettings",
     "PredictionLearner",
     "ReplayLearner",
     "ReplaySettings",
+    "ResidualGradientLearner",
+    "ResidualGradientSettings",
     "RolloutLearner",
     "RolloutSettings",
+    "TangentCorrection",
+    "TwinHead",
     "Update",
 ]
