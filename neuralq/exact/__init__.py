@@ -5,6 +5,7 @@ from neuralq.exact.evaluation import action_values, evaluate, policy_process
 from neuralq.exact.horizon import HorizonSolution, solve_finite_horizon
 from neuralq.exact.operators import Prediction, predict_expected_td, rmsve, td_operator
 from neuralq.exact.planning import METHODS, Solution, count_optimal_policies, optimal_policies, solve
+from neuralq.exact.resolvent import resolvent
 
 __all__ = [
     "METHODS",
@@ -20,6 +21,7 @@ __all__ = [
     "optimal_policies",
     "policy_process",
     "predict_expected_td",
+    "resolvent",
     "rmsve",
     "solve",
     "solve_average",

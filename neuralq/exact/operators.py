@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from neuralq.checks import check_discount, check_fraction, check_positive
+from neuralq.exact.resolvent import resolvent
 
 __all__ = ["Prediction", "predict_expected_td", "rmsve", "td_operator"]
 
@@ -60,7 +61,7 @@ def td_operator(
     """The matrix A ``[d, d]`` and vector b ``[d]`` of the expected TD(λ) update w ← w + α (b − A w).
 
     Args:
-        P_pi: transitions of the target policy, ``[S, S]``, dense or sparse; rows may be substochastic.
+        P_pi: transitions of the target policy, ``[S, S]``, dense or sparse (it stays so); rows may be substochastic.
         r_pi: its expected rewards, ``[S]``.
         features: X, ``[S, d]``.
         d: how often each state is updated, ``[S]``; it need not be P's own distribution (then it is off-policy).
@@ -77,7 +78,7 @@ def td_operator(
     """
     check_discount("gamma", gamma)
     check_fraction("lambda_", lambda_, "for Monte Carlo use lambda_=1")
-    P = P_pi.toarray() if sparse.issparse(P_pi) else np.asarray(P_pi, dtype=np.float64)  # type: ignore[union-attr]
+    P = sparse.csr_array(P_pi) if sparse.issparse(P_pi) else np.asarray(P_pi, dtype=np.float64)
     X, r, weight = (np.asarray(x, dtype=np.float64) for x in (features, r_pi, d))
     num_states = len(r)
     if (
@@ -92,7 +93,7 @@ def td_operator(
         )
     ahead = np.column_stack([X - gamma * (P @ X), r])
     if lambda_ > 0:
-        ahead = np.linalg.solve(np.eye(num_states) - gamma * lambda_ * P, ahead)
+        ahead = resolvent(P, ahead, gamma * lambda_)
     both = X.T @ (weight[:, None] * ahead)
     return both[:, :-1], both[:, -1]
 

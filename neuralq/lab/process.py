@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
+from neuralq.exact import resolvent
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["Arcs", "Process", "linear_process"]
@@ -115,8 +115,7 @@ class Process:
     @cached_property
     def v(self) -> Floats:
         """The exact values of the target policy, (I − γP)⁻¹ r, ``[n]``."""
-        system = sparse.csc_array(sparse.eye_array(self.num_rows) - self.gamma * sparse.csr_array(self.P))
-        return np.asarray(splu(system).solve(self.r))
+        return resolvent(sparse.csr_array(self.P), self.r, self.gamma)
 
     def with_features(self, X: Floats) -> Process:
         """The same chains seen through other features, ``[n, d']``."""
@@ -125,7 +124,8 @@ class Process:
     @cached_property
     def visible(self) -> Floats:
         """An orthonormal basis of the weights that some row sees, ``[d, rank X]``; others never matter to a value."""
-        _, singular, right = np.linalg.svd(self.X, full_matrices=False)
+        tall = self.num_rows > 2 * self.num_weights  # the triangle of X has the same singular values and right vectors
+        _, singular, right = np.linalg.svd(np.linalg.qr(self.X, mode="r") if tall else self.X, full_matrices=False)
         if len(singular) == 0 or singular[0] == 0:
             return np.zeros((self.num_weights, 0))
         kept: Floats = right[singular > 1e-12 * max(self.X.shape) * singular[0]].T

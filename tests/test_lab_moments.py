@@ -1,0 +1,201 @@
+"""Exact means and second moments of sampled updates, against hand arithmetic, plain matrices and simulation.
+
+Mutants that die here: arcs that end an episode forgotten (`_arrivals` without ``ends``), the chance of an arc squared,
+M V M instead of M V Mᵀ, the crossed term of `_blocks` left out, the second successor ignored, classes of a chain merged
+(a frozen weight then looks neutral), a chain that begins at the start distribution instead of D.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from neuralq.lab import moments
+from neuralq.lab.jumps import Jumps, jumps
+from neuralq.lab.methods import TD, Method, method
+from neuralq.lab.moments import (
+    evolve,
+    growth_factors,
+    mean_radius,
+    second_moment_radius,
+    second_moment_stable,
+    steady_covariance,
+)
+from neuralq.lab.process import Process, linear_process
+from neuralq.lab.sampling import stream
+from neuralq.lab.spectrum import first_crossing, visible_process
+from neuralq.mdp import FiniteMDP
+from neuralq_envs.counterexamples import Problem, star
+
+
+def maps_of(process: Process, one: Method = TD, step_size: float = 0.01, **options: float) -> Jumps:
+    return jumps(process, one, one.checked(options), step_size)
+
+
+def two_states(gamma: float = 0.9) -> Problem:
+    """Sutton, Mahmood & White 2016: x = 1, 2; right leads to 2, left to 1; the target always goes right."""
+    mdp = FiniteMDP.from_arrays([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, 1.0]]], np.zeros((2, 2)))
+    return Problem.from_mdp(mdp, [[1.0], [2.0]], gamma=gamma, target_policy=[1, 1],
+                            behaviour_policy=np.full((2, 2), 0.5))  # fmt: skip
+
+
+def random_problem(seed: int, pairs: bool = False, ends: bool = True) -> Problem:
+    rng = np.random.default_rng(seed)
+    mdp = FiniteMDP.garnet(4, 2, 2, seed=seed)
+    if ends:  # state 3 is the end
+        P = np.zeros((2, 4, 4))
+        P[mdp.a_tm1, mdp.s_tm1] = mdp.transition.toarray()
+        P[:, 3] = 0.0
+        mdp = FiniteMDP.from_arrays(P, mdp.reward.reshape(4, 2), substochastic=True, start=[0.5, 0.5, 0.0, 0.0])
+    shape = (4, 2, 3) if pairs else (4, 2)
+    legal = mdp.legal / np.maximum(mdp.legal.sum(axis=1, keepdims=True), 1)
+    target = np.where(legal > 0, rng.dirichlet(np.ones(2), 4), 0.0)
+    return Problem.from_mdp(mdp, rng.normal(size=shape), gamma=0.8, target_policy=target, behaviour_policy=legal)
+
+
+@pytest.mark.parametrize(
+    ("step_size", "radii"),
+    [
+        (0.01, (1.0023925, 1.0023814, 1.0048556, 1.0048110)),
+        (0.005, (1.0011963, 1.0011935, 1.0024095, 1.0023983)),
+    ],
+)
+def test_radii_of_the_star(step_size: float, radii: tuple[float, ...]) -> None:
+    """Computed by an independent float64 iteration of 8x8 matrices per state, 448 unknowns."""
+    process = linear_process(star())
+    for one in (process, visible_process(process)[0]):
+        maps = maps_of(one, step_size=step_size)
+        found = [f(maps, sampling) for f in (mean_radius, second_moment_radius) for sampling in ("iid", "markov")]
+        assert found == pytest.approx(radii, abs=6e-8)
+
+
+def test_radii_of_the_two_state_problem() -> None:
+    maps = maps_of(linear_process(two_states()))
+    assert mean_radius(maps, "markov") == pytest.approx(1.0019881, abs=6e-8)  # independent float64 computation
+    assert second_moment_radius(maps, "markov") == pytest.approx(1.0040316, abs=6e-8)
+    # by hand: μ = ½, ρ = 2 to the right: 1 − α(x² − γ x·2)·2 with x = 1: 1 + .016, x = 2: 1 − .008
+    assert mean_radius(maps, "iid") == pytest.approx((1.0 + 1.016 + 1.0 + 0.992) / 4, abs=1e-14)
+    assert second_moment_radius(maps, "iid") == pytest.approx((2.0 + 1.016**2 + 0.992**2) / 4, abs=1e-14)
+    chain = 0.5 * np.array([[1.0, 1.016**2], [1.0, 0.992**2]])  # from 1 and from 2: left to 1, right to 2
+    assert second_moment_radius(maps, "markov") == pytest.approx(np.abs(np.linalg.eigvals(chain)).max(), abs=1e-14)
+
+
+def kron_radius(process: Process, step_size: float, eta: float) -> float:
+    """ρ of the whole Kronecker operator of ridge TD(0) along a chain, from the textbook's update."""
+    n, d = process.X.shape
+    whole = np.zeros((n, d * d, n, d * d))
+    arcs = process.arcs
+    for i, j, p, rho, discount in zip(arcs.row, arcs.next_row, arcs.probability, arcs.rho, arcs.discount, strict=True):
+        after = process.X[j] if j >= 0 else np.zeros(d)
+        M = np.eye(d) - step_size * (rho * np.outer(process.X[i], process.X[i] - discount * after) + eta * np.eye(d))
+        for k in range(n):
+            arrives = float(k == j) if j >= 0 else process.start[k]
+            whole[k, :, i] += arrives * p * np.kron(M, M)
+    return float(np.abs(np.linalg.eigvals(whole.reshape(n * d * d, n * d * d))).max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_second_moment_radius_is_that_of_the_kronecker_operator(seed: int) -> None:
+    process = linear_process(random_problem(seed, ends=seed % 2 == 0))
+    maps = maps_of(process, step_size=0.3, eta=0.1)
+    expected = kron_radius(process, 0.3, 0.1)
+    assert second_moment_radius(maps, "markov") == pytest.approx(expected, rel=1e-10)
+    assert second_moment_stable(maps, "markov") == (expected < 1)
+
+
+def test_large_operators_are_applied_without_a_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = [maps_of(linear_process(star())), maps_of(linear_process(random_problem(0)), step_size=0.2)]
+    small = [f(one, "markov") for one in maps for f in (mean_radius, second_moment_radius)]
+    monkeypatch.setattr(moments, "LARGEST_DENSE", 5)
+    large = [f(one, "markov") for one in maps for f in (mean_radius, second_moment_radius)]
+    assert large == pytest.approx(small, rel=1e-9)
+    monkeypatch.setattr(moments, "LARGEST", 5)
+    with pytest.raises(ValueError, match="too many for exact moments"):
+        second_moment_radius(maps[0], "markov")
+
+
+def test_step_size_limits_of_ridge_on_the_star() -> None:
+    """η = .5; .129883 from an independent scan, .1441962181 from the 448x448 operator of `kron_radius`."""
+    process = visible_process(linear_process(star()))[0]
+    for sampling, limit, rel in (("iid", 0.129883, 3e-6), ("markov", 0.1441962181, 1e-8)):
+        found = first_crossing(
+            lambda a, kind=sampling: second_moment_stable(maps_of(process, step_size=a, eta=0.5), kind), 0.02, 2.0
+        )
+        assert found == pytest.approx(limit, rel=rel)
+    full = linear_process(star())
+    assert kron_radius(full, 0.14419, 0.5) < 1 < kron_radius(full, 0.14420, 0.5)
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+@pytest.mark.parametrize("name", ["td", "residual", "naive-residual", "tdc", "gtd2"])
+def test_the_mean_of_the_maps_is_the_expected_update(name: str, pairs: bool) -> None:
+    process, one = linear_process(random_problem(1, pairs)), method(name)
+    maps = maps_of(process, one, 0.07)
+    assert one.expected is not None
+    M, c = one.expected(process, one.checked({})).at(np.zeros(1), 0.07)
+    assert maps.mean()[0] == pytest.approx(M, abs=1e-12)
+    assert maps.mean()[1] == pytest.approx(c, abs=1e-12)
+    rows = np.bincount(maps.row, weights=maps.probability)
+    assert rows == pytest.approx(np.ones(process.num_rows))
+    assert (len(maps.M) > len(process.arcs.row)) == (name == "residual")  # two independent successors
+
+
+def test_frozen_weights_are_no_neutral_mode() -> None:
+    """0 → 1 → 1 → ...: the chain soon updates w_1 only, and w_0 rests; independent draws go on updating both."""
+    mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 1.0]]], np.zeros((2, 1)))
+    problem = Problem.from_mdp(mdp, np.eye(2), gamma=0.5, state_distribution=[0.5, 0.5])
+    maps = maps_of(linear_process(problem), step_size=0.2)
+    assert mean_radius(maps, "markov") == pytest.approx(0.9)  # 1 − α (1 − γ), every step in state 1
+    assert second_moment_radius(maps, "markov") == pytest.approx(0.81)
+    assert mean_radius(maps, "iid") == pytest.approx(0.95)
+    nothing = maps_of(linear_process(problem).with_features(np.zeros((2, 2))))
+    assert mean_radius(nothing, "iid") == second_moment_radius(nothing, "markov") == 0.0
+    assert growth_factors(nothing, "markov").shape == (0,)
+
+
+def test_steady_covariance_by_hand() -> None:
+    """w ← (1 − α) w + α R with R = ±1: variance α² / (1 − (1 − α)²), from a bandit with two equal arms."""
+    mdp = FiniteMDP.from_arrays(np.zeros((2, 1, 1)), [[1.0, -1.0]], substochastic=True)
+    problem = Problem.from_mdp(mdp, [[1.0]], gamma=0.9)
+    mean, covariance = steady_covariance(maps_of(linear_process(problem), step_size=0.2))
+    assert mean == pytest.approx(np.zeros(1), abs=1e-14)
+    assert covariance[0, 0] == pytest.approx(0.04 / (1 - 0.64))
+    later = evolve(maps_of(linear_process(problem), step_size=0.2), np.ones(1), 400, "iid")
+    assert later[1] == pytest.approx(covariance)
+    with pytest.raises(ValueError, match="no steady covariance"):
+        steady_covariance(maps_of(linear_process(star())))
+
+
+def test_methods_that_remember_have_no_maps() -> None:
+    process = linear_process(star())
+    with pytest.raises(ValueError, match="no memoryless sampled update"):
+        maps_of(process, TD, lambda_=0.5)
+
+
+def check_against_simulation(seed: int, sampling: str, num_chains: int) -> None:
+    problem = random_problem(seed, pairs=seed % 3 == 2, ends=seed % 2 == 0)
+    process, rng = linear_process(problem), np.random.default_rng(1000 + seed)
+    theta = rng.normal(size=process.num_weights)
+    learner = TD.learner(process, np.tile(theta, (num_chains, 1)), TD.checked({}))  # type: ignore[misc]
+    samples = stream(process, sampling, num_chains, rng)  # type: ignore[arg-type]
+    for _ in range(20):
+        learner.update(next(samples), 0.1)
+    mean, covariance = evolve(maps_of(process, step_size=0.1), theta, 20, sampling)
+    off = learner.theta - mean
+    noise = off.std(axis=0) / np.sqrt(num_chains)
+    assert (np.abs(off.mean(axis=0)) < 4 * noise + 1e-12).all()
+    products = off[:, :, None] * off[:, None, :]
+    noise = products.std(axis=0) / np.sqrt(num_chains)
+    assert (np.abs(products.mean(axis=0) - covariance) < 4 * noise + 1e-12).all()
+
+
+@pytest.mark.parametrize("sampling", ["iid", "markov"])
+@pytest.mark.parametrize("seed", range(3))
+def test_moments_agree_with_simulation(seed: int, sampling: str) -> None:
+    check_against_simulation(seed, sampling, 20_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3, 23))
+def test_moments_agree_with_long_simulation(seed: int) -> None:
+    check_against_simulation(seed, "markov", 200_000)
