@@ -353,3 +353,10 @@ def test_prediction_equals_training_on_random_problems() -> None:
 
 def test_rmsve_weighs_states() -> None:
     assert rmsve([1.0, 2.0], [0.0, 0.0], [0.25, 0.75]) == pytest.approx(math.sqrt(0.25 + 3.0))
+
+
+@pytest.mark.parametrize("method", ["auto", "value-iteration", "policy-iteration", "linear-programming", "rtdp"])
+def test_a_discount_of_its_own_ends_a_loop(method: str) -> None:
+    # State 1 stays where it is, and each step ends the episode with probability 1/2: V(1) = −1 + V(1)/2 = −2.
+    loop = FiniteMDP(2, 1, [0, 1], [0, 0], sparse.csr_array([[0.0, 1.0], [0.0, 1.0]]), [-1.0, -1.0], [1.0, 0.5])  # type: ignore[arg-type]
+    assert solve(loop, 1.0, method=method).v == pytest.approx([-3.0, -2.0], abs=1e-7)

@@ -73,20 +73,20 @@ def policy_values(problem: Problem, policy: NDArray[np.int64], guess: Floats) ->
     chosen = sparse.csr_array(mdp.transition[policy])
     system = sparse.eye_array(mdp.num_states) - sparse.diags_array(problem.rows.decay[policy] * acting) @ chosen
     if math.isinf(problem.reach):
-        _check_ends(problem, chosen)
+        _check_ends(problem, problem.rows.decay[policy], chosen)
     factors = splu(sparse.csc_array(system))
     v = np.asarray(factors.solve(problem.rows.reward[policy] * acting)) + 0.0  # no -0.0 for readers to wonder at
     steps = float(factors.solve(acting).max())  # expected, discounted: so often does the rounding of a step count
     return v, 2 * steps * problem.rounding(v), 0
 
 
-def _check_ends(problem: Problem, chosen: sparse.csr_array) -> None:
-    """Every state reaches, against the arrows, one that may end.
+def _check_ends(problem: Problem, decay: Floats, chosen: sparse.csr_array) -> None:
+    """Every state reaches, against the arrows, one that may end, by missing mass or by a discount below 1.
 
     Raises:
         ArithmeticError: it does not; the policy has no finite value.
     """
-    ends = ~problem.acts | (np.asarray(chosen.sum(axis=1)).reshape(-1) < 1 - 1e-9)
+    ends = ~problem.acts | (decay * np.asarray(chosen.sum(axis=1)).reshape(-1) < 1 - 1e-9)
     while True:
         more = ends | (chosen @ ends.astype(np.float64) > 0)
         if np.array_equal(more, ends):
