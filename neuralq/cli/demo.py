@@ -20,7 +20,7 @@ from neuralq.recipes.config import config_from_dict
 from neuralq.record import is_run_folder, read_metrics
 from neuralq.report import write_demo_report
 
-__all__ = ["baird", "demo"]
+__all__ = ["baird", "demo", "plain_star", "show_star"]
 
 TARGET = 475.0
 
@@ -39,7 +39,7 @@ def demo(argv: list[str]) -> int:
     began = time.perf_counter()
     console = Console(file=sys.stderr)
     run = _cartpole(folder / "cartpole", options.seed, console)
-    predictions, results = _star(console, num_steps=5000, gamma=0.99, step_size=0.01, num_upper=6)
+    predictions, results = show_star(console, num_steps=5000, gamma=0.99, step_size=0.01, num_upper=6)
     facts = {
         "environment": "CartPole-v1",
         "environment steps": run.env_steps,
@@ -49,7 +49,7 @@ def demo(argv: list[str]) -> int:
     }
     path = write_demo_report(folder / "report.html", read_metrics(run.run_dir), facts, results, target=TARGET)
     seconds = time.perf_counter() - began
-    plain = {**run.summary(), "report": str(path), "seconds": seconds, "baird": _plain(predictions, results)}
+    plain = {**run.summary(), "report": str(path), "seconds": seconds, "baird": plain_star(predictions, results)}
     print_result(plain, options.json, [f"report: {path} ({seconds:.0f} s in all)"])
     if not run.reached:
         raise Failure(f"CartPole-v1 did not reach {TARGET:g} with seed {options.seed}; try another seed")
@@ -88,16 +88,17 @@ def baird(argv: list[str]) -> int:
     parser.add_argument("--num-upper", type=int, default=6, help="upper states of the star (default: 6)")
     parser.add_argument("--num-steps", type=int, default=5000, help="sweeps (default: 5000)")
     options = parser.parse_args(argv)
-    predictions, results = _star(
+    predictions, results = show_star(
         Console(file=sys.stderr), options.num_steps, options.gamma, options.step_size, options.num_upper
     )
-    print_result({"baird": _plain(predictions, results)}, options.json, [])
+    print_result({"baird": plain_star(predictions, results)}, options.json, [])
     return 0
 
 
-def _star(
+def show_star(
     console: Console, num_steps: int, gamma: float, step_size: float, num_upper: int
 ) -> tuple[list[BairdPrediction], list[BairdResult]]:
+    """Print what is predicted of each representation of the star, then what is measured; both are returned."""
     console.print(
         f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained",
         soft_wrap=True,
@@ -120,7 +121,8 @@ def _star(
     return predictions, results
 
 
-def _plain(predictions: Sequence[BairdPrediction], results: Sequence[BairdResult]) -> list[dict[str, Any]]:
+def plain_star(predictions: Sequence[BairdPrediction], results: Sequence[BairdResult]) -> list[dict[str, Any]]:
+    """Predictions and results as JSON takes them."""
     return [
         {
             "representation": r.representation,

@@ -12,13 +12,15 @@ fitted iteration on Xw every sweep is a regression: a hard target network whose 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.checks import check_fraction, check_whole
+from neuralq.checks import check_whole
 from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
+from neuralq.lab.methods.gradient import Trace
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross, td
 from neuralq.lab.process import Process
@@ -86,18 +88,20 @@ def lspi(process: Process, w0: Floats, num_iterations: int = 100) -> PolicyItera
 
 
 class _Solver:
-    """Sums of matrices and vectors for every seed, solved when the weights are asked for."""
+    """Sums of left (x − γx')ᵀ and of left r for every seed, solved when the weights are asked for."""
 
-    def __init__(self, w0: Floats, eta: float) -> None:
+    def __init__(self, w0: Floats, eta: float, left: Callable[[Sample], Floats]) -> None:
+        self._left = left
         num_seeds, d = w0.shape
         self._matrix = np.zeros((num_seeds, d, d))
         self._vector = np.zeros((num_seeds, d))
         self._eta, self._count = eta, 0
         self._theta, self._stale = w0.copy(), False
 
-    def add(self, left: Floats, right: Floats, reward: Floats) -> None:
+    def update(self, sample: Sample, step_size: float) -> None:
+        left, right = self._left(sample), sample.x - sample.discount[:, None] * sample.x_next
         self._matrix += left[:, :, None] * right[:, None, :]
-        self._vector += reward[:, None] * left
+        self._vector += sample.reward[:, None] * left
         self._count += 1
         self._stale = True
 
@@ -116,28 +120,17 @@ class _Solver:
         self._theta, self._stale = value, False
 
 
-class _LSTD(_Solver):
-    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        super().__init__(w0, options["eta"])
-        self._lambda = options["lambda_"]
-        check_fraction("lambda_", self._lambda)
-        self._z = np.zeros_like(w0)
-        self._decay = np.zeros(len(w0))
-
-    def update(self, sample: Sample, step_size: float) -> None:
-        decay = np.where(sample.begins, 0.0, self._decay)
-        self._z = sample.rho[:, None] * (decay[:, None] * self._z + sample.x)
-        self.add(self._z, sample.x - sample.discount[:, None] * sample.x_next, sample.reward)
-        self._decay = sample.discount * self._lambda
+def _lstd(process: Process, w0: Floats, options: Options) -> _Solver:
+    trace = Trace(w0.shape, options["lambda_"])
+    return _Solver(w0, options["eta"], lambda sample: trace.follow(sample, sample.rho))
 
 
-class _BRM(_Solver):
-    def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        super().__init__(w0, options["eta"])
+def _brm(process: Process, w0: Floats, options: Options) -> _Solver:
+    def back(sample: Sample) -> Floats:
+        ahead = sample.discount_second[:, None] * sample.x_second
+        return np.asarray(sample.rho[:, None] * (sample.x - ahead))
 
-    def update(self, sample: Sample, step_size: float) -> None:
-        left = sample.rho[:, None] * (sample.x - sample.discount_second[:, None] * sample.x_second)
-        self.add(left, sample.x - sample.discount[:, None] * sample.x_next, sample.reward)
+    return _Solver(w0, options["eta"], back)
 
 
 def _pinv(matrix: Floats) -> Floats:
@@ -202,12 +195,12 @@ def _expected_lspi(process: Process, options: Options) -> Expected:
 
 LSTD = Method(
     "lstd", "LSTD(λ)", "Bradtke & Barto 1996; Boyan 2002; off-policy Yu 2010", {"lambda_": 0.0, "eta": 0.0},
-    _expected_lstd, _LSTD, remembers=lambda options: True,
+    _expected_lstd, _lstd, remembers=lambda options: True,
     note="has no step size; its sampled weights solve the averages of all transitions so far, plus η",
 )  # fmt: skip
 BRM = Method(
     "brm", "Bellman residual minimisation", "Schweitzer & Seidmann 1985; Baird 1995; Lagoudakis & Parr 2003",
-    {"eta": 0.0}, _expected_brm, _BRM, remembers=lambda options: True,
+    {"eta": 0.0}, _expected_brm, _brm, remembers=lambda options: True,
     note="has no step size; needs two independent successors",
 )  # fmt: skip
 FITTED = Method(
