@@ -6,6 +6,8 @@ import sys
 import zipfile
 from pathlib import Path
 
+STATIC = ("index.html", "style.css", "icon.svg", "lab.js", "charts.js", "numbers.js", "sliders.js", "words.js")
+
 
 def main(wheel: str) -> None:
     """Raises AssertionError for what does not belong into the wheel, or does not work once it is installed."""
@@ -13,6 +15,8 @@ def main(wheel: str) -> None:
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert tops == {"neuralq", "neuralq_envs", "neuralq_plugin.pth"}, f"unexpected top-level names: {sorted(tops)}"
     assert {"neuralq/py.typed", "neuralq_envs/py.typed"} <= set(names), "a py.typed is missing"
+    page = {f"neuralq/web/static/{name}" for name in STATIC}
+    assert page <= set(names), f"the lab's page is incomplete: {sorted(page - set(names))} are missing"
     strays = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc"))]
     assert not strays, f"caches in the wheel: {strays}"
 
