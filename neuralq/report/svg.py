@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "MARKERS", "MissingExtra", "draw_svg", "scale_axis", "steps_axis", "tame"]
+__all__ = ["COLOURS", "MARKERS", "MissingExtra", "draw_png", "draw_svg", "scale_axis", "steps_axis", "tame"]
 
 # Okabe and Ito (2008), "Color universal design": told apart with every common colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -64,6 +65,33 @@ def draw_svg(
     Raises:
         MissingExtra: matplotlib is not installed.
     """
+    buffer = io.StringIO()
+    with _painted(size_inches, paint) as figure:
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
+    return _inline(buffer.getvalue(), name, title, description)
+
+
+def draw_png(size_inches: tuple[float, float], paint: Callable[[Figure], None], dots_per_inch: int = 150) -> bytes:
+    """The same figure as a PNG file on white, for where an SVG cannot go.
+
+    Args:
+        size_inches: width and height.
+        paint: draws.
+        dots_per_inch: resolution.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    buffer = io.BytesIO()
+    with _painted(size_inches, paint) as figure:
+        figure.savefig(buffer, format="png", dpi=dots_per_inch, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+@contextmanager
+def _painted(size_inches: tuple[float, float], paint: Callable[[Figure], None]) -> Iterator[Figure]:
+    """The painted figure, while the house's style holds: text is laid out when a file is written."""
     try:
         from matplotlib import style
         from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -72,15 +100,12 @@ def draw_svg(
         raise MissingExtra(
             f'figures need matplotlib ({error}); install it with: pip install "neuralq[plot]"'
         ) from error
-    buffer = io.StringIO()
     with style.context(["default", _STYLE]), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a glyph that the font lacks, a layout too tight: the figure is still right
         figure = Figure(figsize=size_inches, layout="constrained")
         FigureCanvasSVG(figure)
         paint(figure)
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
-    return _inline(buffer.getvalue(), name, title, description)
+        yield figure
 
 
 def _inline(text: str, name: str, title: str, description: str) -> str:
