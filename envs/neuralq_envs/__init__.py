@@ -1,7 +1,8 @@
 """Environments with a known answer: each gives its exact `FiniteMDP` beside the Gymnasium interface.
 
-Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`); those have no finite model. `register` is the
-package's ``gymnasium.envs`` entry point, so ``gymnasium.make("neuralq/MitchellGrid-v0")`` finds them.
+Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`), and games too large for an exact model
+(`GAMES`). `register` is the package's ``gymnasium.envs`` entry point, so ``gymnasium.make("neuralq/MitchellGrid-v0")``
+finds them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["CLASSIC", "ENVIRONMENTS", "Classic", "Registration", "register", "vector_twin"]
+__all__ = ["CLASSIC", "ENVIRONMENTS", "GAMES", "Classic", "Registration", "register", "vector_twin"]
 
 
 class Registration(NamedTuple):
@@ -47,6 +48,10 @@ ENVIRONMENTS = {
     "neuralq/ShortcutMaze-v0": Registration("neuralq_envs.changing", {"change": "shortcut"}, has_vector=False),
     "neuralq/TicTacToe-v0": Registration("neuralq_envs.tictactoe"),
     "neuralq/WindyGridworld-v0": Registration("neuralq_envs.windy"),
+}
+
+GAMES = {
+    "neuralq/Backgammon-v0": Registration("neuralq_envs.backgammon.single_agent", has_vector=False),
 }
 
 
@@ -124,7 +129,7 @@ def register() -> None:
     # Imported here: importing Gymnasium calls this function, which must be there by then.
     from gymnasium.envs import registration
 
-    for env_id, one in ENVIRONMENTS.items():
+    for env_id, one in (ENVIRONMENTS | GAMES).items():
         if env_id not in registration.registry:
             registration.register(
                 env_id,
