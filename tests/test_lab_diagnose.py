@@ -1,8 +1,9 @@
 """Verdicts before training, against hand arithmetic, published figures and training itself.
 
-Mutants that die here: the basis of range(M − I) replaced by that of its transpose, eigenvalues of all of M (redundant
-weights look neutral), a bound 2/|λ| instead of 2 Re(λ)/|λ|², the drift not looked at, an unstable piece held against a
-run that leaves it, a leap kept although the piece changed, bisection of the whole range instead of the first crossing.
+Mutants that die here: the basis of range(M − I) replaced by that of its transpose (the spectrum is the same there, the
+fixed point is not), eigenvalues of all of M (redundant weights look neutral), a bound 2/|λ| instead of 2 Re(λ)/|λ|²,
+the drift not looked at, an unstable piece held against a run that leaves it, a leap kept although the piece changed,
+bisection of the whole range instead of the first crossing.
 """
 
 from __future__ import annotations
@@ -227,6 +228,13 @@ def test_a_neutral_mode_inside_the_moving_space_stays() -> None:
     assert moving_spectrum(np.array([[1.0, 1.0], [0.0, 1.0]])) == pytest.approx(np.array([1.0]))
     assert moving_spectrum(np.eye(3)).shape == (0,)
     assert limit_of(np.array([[0.0, 1.0], [0.0, 0.0]]), np.zeros(2), np.zeros(2)).singularity == 0.0
+
+
+def test_the_fixed_point_is_reached_along_what_the_update_moves() -> None:
+    """w_1 ← w_1 − (w_1 + w_2), w_2 stays: from (1, 1) that is (−1, 1), not the (0, 0) across the null space."""
+    G = np.array([[1.0, 1.0], [0.0, 0.0]])
+    found = limit_of(G, np.zeros(2), np.ones(2)).theta
+    assert found == pytest.approx(np.array([-1.0, 1.0]), abs=1e-12)
 
 
 def garnet_problem(seed: int) -> tuple[Problem, float]:

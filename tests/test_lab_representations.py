@@ -3,8 +3,8 @@
 The sweeps of Baird's star for control are an independent double-precision iteration of its expected Q-learning update.
 
 Mutants that die here: the ratio in a problem about Q · weights of pairs that forget the state distribution · the mean
-of the next values where the maximum belongs · terminal states that count for the cap · initial weights that are
-ignored · networks that see the features where states were asked for.
+of the next values where the maximum belongs · initial weights that are ignored · networks that see the
+features where states were asked for.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from neuralq.cli import Failure, command_parser, print_result
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
     from neuralq.lab import Problem
 
@@ -25,6 +26,7 @@ COMMANDS = {
     "critical": ("neuralq.cli.lab_cases", "critical", "the value of a parameter at which stability changes"),
     "prescribe": ("neuralq.cli.lab_cases", "prescribe", "what to change so that learning converges, best first"),
     "run": ("neuralq.cli.lab_cases", "run", "train a method on a problem, over many seeds"),
+    "fitted": ("neuralq.cli.lab_fitted", "fitted", "fitted value iteration: which functions may be fitted, and why"),
 }
 
 Parser = argparse.ArgumentParser
@@ -92,11 +94,22 @@ def _serve(host: str, port: int) -> None:
 
 
 def list_command(argv: list[str]) -> int:
-    """List problems and methods."""
+    """List problems, methods, and what `neuralq lab fitted` knows."""
     parser = command_parser(
         "lab list", "Every problem and every method of the lab, with their sources.", "neuralq lab list"
     )
     options = parser.parse_args(argv)
+    from neuralq.cli.fitted_choices import fitted_table, plain_choices
+
+    if options.json:
+        show(True, {**_plain_list(), **plain_choices()})
+    else:
+        show(False, {}, *_tables(), fitted_table())
+    return 0
+
+
+def _tables() -> tuple[Table, Table]:
+    """Problems and methods for people."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text
@@ -118,7 +131,15 @@ def list_command(argv: list[str]) -> int:
         on = "; learns pairs" if method.rows == "pairs" else ""
         methods.add_row(method.name, Text.assemble(method.title, (f" ({method.source}{on})", "dim")), settings)
     problems.title_justify = methods.title_justify = "left"
-    plain = {
+    return problems, methods
+
+
+def _plain_list() -> dict[str, Any]:
+    """Problems and methods for programs."""
+    from neuralq.lab import METHODS, PROBLEMS
+
+    made = [entry.make() for entry in PROBLEMS]
+    return {
         "problems": [
             {"name": one.name, "title": one.title, "source": one.source, "known": one.known, "gamma": one.gamma,
              "step_size": one.step_size, "num_weights": one.num_weights, "learns_q": one.learns_q}
@@ -130,8 +151,6 @@ def list_command(argv: list[str]) -> int:
             for one in METHODS
         ],
     }  # fmt: skip
-    show(options.json, plain, problems, methods)
-    return 0
 
 
 def show(as_json: bool, plain: dict[str, Any], *parts: RenderableType) -> None:
@@ -180,7 +199,7 @@ def _check_values(made: Problem) -> None:
 
     try:
         finite = bool(np.isfinite(linear_process(made).v).all())
-    except RuntimeError:
+    except (RuntimeError, ValueError):
         finite = False
     if not finite:
         raise Failure(f"{made.name} never ends, so it has no values with γ = 1; choose a --gamma below 1")

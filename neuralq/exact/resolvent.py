@@ -26,6 +26,9 @@ Floats = NDArray[np.float64]
 LARGEST_FACTOR = 30_000_000
 """Numbers in the factors of a sparse chain beyond which it is iterated instead: about 400 MB with their indices."""
 
+LARGEST_RATIO = 1e13
+"""Largest solution per unit of Y that is believed: what a singular matrix leaves after rounding is larger."""
+
 RESIDUAL = 1e-13
 BLOCK = 32
 """Columns iterated together: few enough that 10⁴ rows of them stay in the cache."""
@@ -41,12 +44,26 @@ def resolvent(P: Floats | sparse.sparray, Y: Floats, scale: float) -> Floats:
         scale: c in [0, 1].
 
     Raises:
-        ValueError: the iteration did not reach a relative residual of 1e-12 (c too close to 1 for a wide chain).
+        ValueError: I − cP is singular (c = 1 for a chain that never ends), or the iteration did not reach a relative
+            residual of 1e-12 (c too close to 1 for a wide chain).
 
     Example:
         >>> resolvent(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([1.0, 2.0]), 0.5).tolist()
         [2.0, 2.0]
     """
+    try:
+        solved = _solved(P, Y, scale)
+    except (RuntimeError, np.linalg.LinAlgError):
+        solved = np.full_like(Y, np.inf)
+    if not np.abs(solved).max(initial=0.0) <= LARGEST_RATIO * np.abs(Y).max(initial=0.0):
+        raise ValueError(
+            f"I − cP is singular for c = {scale:g}: with γ = 1 a chain that never ends has no finite values; use a "
+            "smaller gamma or lambda_"
+        )
+    return solved
+
+
+def _solved(P: Floats | sparse.sparray, Y: Floats, scale: float) -> Floats:
     if not sparse.issparse(P):
         return np.asarray(np.linalg.solve(np.eye(len(Y)) - scale * np.asarray(P), Y))
     chain = sparse.csr_array(P)

@@ -5,8 +5,10 @@
     prescribe(problem)              what to change so that it converges, best first
     run(problem, method)            the errors of a run over many seeds
     matrix(problems, methods)       all of them, predicted and measured side by side
+    diagnose_fitted(world, support, regressor)    fitted value iteration on continuous states, and why it fails
 
-Whatever needs PyTorch (networks, the star's five representations, the monitor of a run) is loaded at its first use.
+Whatever needs PyTorch (networks, the star's five representations, the monitor of a run) is loaded at its first use, and
+so is fitted value iteration.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from __future__ import annotations
 # package to the module, and only what is bound afterwards stays.
 from neuralq.lab.critical import CRITICAL_PARAMETERS, NoBoundary, StabilityScan, critical, scan
 from neuralq.lab.diagnose import Diagnosis, diagnose
+from neuralq.lab.grow_support import GrownSupport, grow_support
 from neuralq.lab.matrix import Cell, Matrix, matrix
 from neuralq.lab.methods import METHODS, Method, method
 from neuralq.lab.prescribe import Remedy, prescribe
@@ -31,7 +34,27 @@ if TYPE_CHECKING:
     from neuralq.lab.expected import expected_backup as expected_backup
     from neuralq.lab.expected import expected_td_step as expected_td_step
     from neuralq.lab.expected import local_growth as local_growth
+    from neuralq.lab.fitted import FittedRun as FittedRun
+    from neuralq.lab.fitted import fitted_iteration as fitted_iteration
+    from neuralq.lab.fitted_diagnosis import FittedDiagnosis as FittedDiagnosis
+    from neuralq.lab.fitted_diagnosis import diagnose_fitted as diagnose_fitted
     from neuralq.lab.monitor import DivergenceMonitor as DivergenceMonitor
+    from neuralq.lab.network_regressor import NetworkRegressor as NetworkRegressor
+    from neuralq.lab.regressors import GridInterpolation as GridInterpolation
+    from neuralq.lab.regressors import KernelSmoothing as KernelSmoothing
+    from neuralq.lab.regressors import LeastSquares as LeastSquares
+    from neuralq.lab.regressors import LocallyWeighted as LocallyWeighted
+    from neuralq.lab.regressors import NearestNeighbours as NearestNeighbours
+    from neuralq.lab.regressors import Regressor as Regressor
+    from neuralq.lab.regressors import StateAggregation as StateAggregation
+    from neuralq.lab.regressors import linear_features as linear_features
+    from neuralq.lab.regressors import quadratic_features as quadratic_features
+    from neuralq_envs.counterexamples.boyan_moore import car_on_the_hill as car_on_the_hill
+    from neuralq_envs.counterexamples.boyan_moore import gridworld as gridworld
+    from neuralq_envs.counterexamples.boyan_moore import puddle_world as puddle_world
+    from neuralq_envs.counterexamples.continuous import ContinuousModel as ContinuousModel
+    from neuralq_envs.counterexamples.continuous import grid_support as grid_support
+    from neuralq_envs.counterexamples.continuous import random_support as random_support
 
 __all__ = [
     "CRITICAL_PARAMETERS",
@@ -40,48 +63,90 @@ __all__ = [
     "BairdPrediction",
     "BairdResult",
     "Cell",
+    "ContinuousModel",
     "Diagnosis",
     "DivergenceMonitor",
     "ExpectedBackup",
+    "FittedDiagnosis",
+    "FittedRun",
+    "GridInterpolation",
+    "GrownSupport",
+    "KernelSmoothing",
+    "LeastSquares",
+    "LocallyWeighted",
     "Matrix",
     "Method",
+    "NearestNeighbours",
+    "NetworkRegressor",
     "NoBoundary",
     "Problem",
+    "Regressor",
     "Remedy",
     "Run",
     "StabilityScan",
+    "StateAggregation",
+    "car_on_the_hill",
     "critical",
     "diagnose",
+    "diagnose_fitted",
     "expected_backup",
     "expected_td_step",
+    "fitted_iteration",
+    "grid_support",
+    "gridworld",
+    "grow_support",
+    "linear_features",
     "local_growth",
     "matrix",
     "method",
     "predict_baird",
     "prescribe",
     "problem",
+    "puddle_world",
+    "quadratic_features",
+    "random_support",
     "run",
     "run_baird",
     "scan",
 ]
 
-# Where the names live that need PyTorch; none of them is the name of a module here.
+# Where the names live that need PyTorch, or that few need; none of them is the name of a module here.
 _HOMES = {
     "BairdPrediction": "neuralq.lab.baird",
     "BairdResult": "neuralq.lab.baird",
+    "ContinuousModel": "neuralq_envs.counterexamples.continuous",
     "DivergenceMonitor": "neuralq.lab.monitor",
     "ExpectedBackup": "neuralq.lab.expected",
+    "FittedDiagnosis": "neuralq.lab.fitted_diagnosis",
+    "FittedRun": "neuralq.lab.fitted",
+    "GridInterpolation": "neuralq.lab.regressors",
+    "KernelSmoothing": "neuralq.lab.regressors",
+    "LeastSquares": "neuralq.lab.regressors",
+    "LocallyWeighted": "neuralq.lab.regressors",
+    "NearestNeighbours": "neuralq.lab.regressors",
+    "NetworkRegressor": "neuralq.lab.network_regressor",
+    "Regressor": "neuralq.lab.regressors",
+    "StateAggregation": "neuralq.lab.regressors",
+    "car_on_the_hill": "neuralq_envs.counterexamples.boyan_moore",
+    "diagnose_fitted": "neuralq.lab.fitted_diagnosis",
     "expected_backup": "neuralq.lab.expected",
     "expected_td_step": "neuralq.lab.expected",
+    "fitted_iteration": "neuralq.lab.fitted",
+    "grid_support": "neuralq_envs.counterexamples.continuous",
+    "gridworld": "neuralq_envs.counterexamples.boyan_moore",
+    "linear_features": "neuralq.lab.regressors",
     "local_growth": "neuralq.lab.expected",
     "predict_baird": "neuralq.lab.baird",
+    "puddle_world": "neuralq_envs.counterexamples.boyan_moore",
+    "quadratic_features": "neuralq.lab.regressors",
+    "random_support": "neuralq_envs.counterexamples.continuous",
     "run_baird": "neuralq.lab.baird",
 }
 
 if not TYPE_CHECKING:  # a type checker would believe that every name exists
 
     def __getattr__(name: str) -> object:
-        """Loads a name that needs PyTorch at its first use.
+        """Loads a name at its first use.
 
         Raises:
             AttributeError: there is no such name.

@@ -65,6 +65,7 @@ CRITICAL_PARAMETERS = {
 """Every parameter that has a critical value, and where it is looked for."""
 
 _POINTS = 241
+_LARGEST = float(np.finfo(np.float64).max)  # the margin where nothing moves, and minus that where float64 overflows
 _LARGEST_RATIO = 1.0 - 1e-9  # γ and λ below 1 by this: continuing problems have no values at γ = 1
 
 
@@ -154,6 +155,9 @@ def scan(
 
     Arguments as for `critical`; ``bounds`` replaces the range.
 
+    Raises:
+        ValueError: what `critical` refuses, or bounds that are no range.
+
     Example:
         >>> from neuralq_envs.counterexamples import star
         >>> [(round(low, 6), round(high, 6)) for low, high in scan(star(), "gamma").stable]
@@ -168,9 +172,7 @@ def scan(
         chosen = method_named(usual.method)
     if parameter != "gamma":
         chosen.checked({parameter: usual.high})
-    low, high = (usual.low, usual.high) if bounds is None else bounds
-    values = _points(usual.spacing, low, high)
-
+    values = _values_of(parameter, usual, bounds)
     seen = None if parameter == "gamma" else visible_process(linear_process(problem))[0]
 
     def margin(value: float) -> float:
@@ -220,11 +222,26 @@ def _margin(process: Process, chosen: Method, usual: float, step_size: float | N
     if not expected.linear:
         raise ValueError(f"the expected update of {chosen.title} changes with the weights: use diagnose instead")
     if step_size is None and expected.generator is not None:
-        return float(flow_spectrum(expected.generator[0]).real.min(initial=np.inf))
+        return float(flow_spectrum(expected.generator[0]).real.min(initial=_LARGEST))
     alpha = usual if step_size is None else step_size
     start = expected.initial(np.zeros(process.num_weights))
-    factors = moving_spectrum(expected.at(start, alpha)[0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        M = expected.at(start, alpha)[0]
+    if not np.isfinite(M).all():  # the power of an update that explodes
+        return -_LARGEST
+    factors = moving_spectrum(M)
     return 1.0 - float(np.abs(factors).max(initial=0.0))
+
+
+def _values_of(parameter: str, usual: _Range, bounds: tuple[float, float] | None) -> Floats:
+    """Where a scan looks."""
+    low, high = (usual.low, usual.high) if bounds is None else bounds
+    if not (np.isfinite([low, high]).all() and low < high) or (usual.spacing != "linear" and low <= 0):
+        least = "" if usual.spacing == "linear" else " with from > 0"
+        raise ValueError(
+            f"bounds of {parameter} must be finite numbers (from, to) in rising order{least}, got {bounds!r}"
+        )
+    return _points(usual.spacing, low, high)
 
 
 def _points(spacing: str, low: float, high: float) -> Floats:

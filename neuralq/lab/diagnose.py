@@ -136,7 +136,13 @@ def _check_sampling(case: _Case) -> None:
 
 def _linear(case: _Case) -> Diagnosis:
     expected, alpha = case.expected, case.alpha
-    M, c = expected.at(case.theta, alpha)
+    with np.errstate(over="ignore", invalid="ignore"):
+        M, c = expected.at(case.theta, alpha)
+    if not np.isfinite(M).all():  # a period is a power of the update
+        raise ValueError(
+            f"one application of {case.method.title} with α = {alpha:g} multiplies the weights by more than float64 "
+            "holds: it diverges; use a smaller step size"
+        )
     if expected.generator is not None:
         rates = flow_spectrum(expected.generator[0])
         factors, bound = 1 - alpha * rates, flow_bound(rates)
@@ -154,14 +160,17 @@ def _linear(case: _Case) -> Diagnosis:
     radius = float(np.abs(factors[0])) if len(factors) else 0.0
     drift = float(np.linalg.norm(limit.drift)) * (alpha if expected.generator is not None else 1.0)
     point, error, best, scale = _errors(case, limit)
+    if drift > 0:  # the mean leaves linearly at every step size, and takes the mean square with it
+        bound, second_bound = 0.0, None if second_bound is None else 0.0
+        radius, second = max(radius, 1.0), None if second is None else max(second, 1.0)
     verdict = _verdict(radius, second, drift, is_poor(error, best, scale, case.problem.gamma))
     return Diagnosis(
         case.problem.name, case.method.title, case.options, alpha, case.sampling,
         verdict in ("converges", "stable but poor fixed point"), verdict,
-        max(radius, 1.0) if drift > 0 else radius, second, bound, second_bound,
+        radius, second, bound, second_bound,
         _turns(factors), _doubling(radius, expected.updates_per_sweep), factors, rank,
         point, error, best, limit.singularity, drift, scale, updates=expected.updates_per_sweep,
-        follow_on=second is not None and not case.memoryless,
+        follow_on=second is not None and not case.memoryless, flow=expected.generator is not None,
     )  # fmt: skip
 
 
@@ -202,6 +211,8 @@ def _piecewise(case: _Case) -> Diagnosis:
     verdict: Verdict = "neutral" if path.outcome == "undecided" else path.outcome
     if settled and poor:
         verdict = "stable but poor fixed point"
+    if settled and radius >= 1 - NEUTRAL:  # it rests where it starts, to the last bit, on a point that holds nothing
+        settled, verdict = False, "diverges" if radius > 1 + NEUTRAL else "neutral"
     bound = None
     if verdict not in ("chatters", "neutral"):
         bound = _scanned_bound(lambda a: case.expected.at(path.theta, a)[0], case.alpha)
@@ -209,6 +220,7 @@ def _piecewise(case: _Case) -> Diagnosis:
         case.problem.name, case.method.title, case.options, case.alpha, case.sampling, settled, verdict, radius,
         None, bound, None, _turns(factors), _doubling(radius, 1) if verdict == "diverges" else None, factors,
         len(factors), point, error, best, limit.singularity, 0.0, scale, regions=path.regions,
+        flow=_is_flow(case.expected, path.theta, case.alpha),
     )  # fmt: skip
 
 
@@ -251,6 +263,12 @@ def _scanned_bound(matrix_at: Callable[[float], Floats], alpha: float) -> float:
         return bool(np.abs(moving_spectrum(matrix_at(step_size))).max(initial=0.0) < 1)
 
     return first_crossing(stable, 1e-3 * alpha, 1e4 * alpha, factor=1.1, floor=1e-2)
+
+
+def _is_flow(expected: Expected, theta: Floats, alpha: float) -> bool:
+    """Whether the change of the piece at θ is proportional to the step size."""
+    once, twice = (expected.at(theta, a)[0] - np.eye(len(theta)) for a in (alpha, 2 * alpha))
+    return bool(np.allclose(twice, 2 * once, rtol=1e-9, atol=0))
 
 
 def _errors(case: _Case, limit: Limit) -> tuple[Floats | None, float | None, float | None, float | None]:

@@ -125,7 +125,7 @@ def _maps(
 ) -> tuple[Floats, Floats]:
     probes = np.vstack([np.zeros(size), np.eye(size)])
     M, c = np.empty((len(arc), size, size)), np.empty((len(arc), size))
-    stride = max(1, _CHUNK // ((size + 1) * max(size, process.num_weights)))
+    stride = max(1, _CHUNK // ((size + 1) * max(size, process.num_weights, 1)))
     for k in range(0, len(arc), stride):
         some = slice(k, k + stride)
         num = len(arc[some])

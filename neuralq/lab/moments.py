@@ -204,7 +204,7 @@ def _moved(maps: Jumps, kept: NDArray[np.bool_]) -> Floats:
     """A basis of all that these arcs move."""
     size = maps.M.shape[1]
     change = np.swapaxes(maps.M[kept] - np.eye(size), 0, 1)
-    return moving_space(change.reshape(size, -1)) if kept.any() else np.zeros((size, 0))
+    return moving_space(change.reshape(size, -1)) if kept.any() and size else np.zeros((size, 0))
 
 
 def _classes(maps: Jumps, sampling: str) -> Iterator[Jumps]:

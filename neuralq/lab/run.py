@@ -137,6 +137,7 @@ def run(
     """
     check_whole("num_steps", num_steps)
     check_whole("num_seeds", num_seeds)
+    check_whole("seed", seed, 0)
     check_choice("sampling", sampling, ("expected", "iid", "markov"))
     alpha = problem.step_size if step_size is None else step_size
     check_positive("step_size", alpha)

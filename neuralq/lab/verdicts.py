@@ -38,6 +38,9 @@ Verdict = Literal[
     "neutral",
 ]
 
+MOST_REGIONS = 64
+"""Pieces of one run that are kept; of a run that goes through more, the last ones."""
+
 POOR = 10.0
 """Largest ratio of errors ever tolerated: 1/√(1 − γ²), the bound of on-policy TD(0), passes it from γ = .995 on."""
 
@@ -93,6 +96,7 @@ class Diagnosis:
         updates: sampled updates that one application stands for.
         regions: pieces that a piecewise update passed through, the last one last; empty for linear ones.
         follow_on: whether the second moment is that of ETD's follow-on instead of that of the weights.
+        flow: whether the change per update is proportional to α, so that what grows at one α grows at every.
     """
 
     problem: str
@@ -120,6 +124,7 @@ class Diagnosis:
     updates: int = 1
     regions: tuple[Region, ...] = ()
     follow_on: bool = False
+    flow: bool = True
 
     @property
     def rates(self) -> NDArray[np.complex128]:
@@ -133,10 +138,11 @@ class Diagnosis:
             >>> from neuralq.lab.diagnose import diagnose
             >>> from neuralq_envs.counterexamples import star
             >>> print(diagnose(star()).explain())  # doctest: +ELLIPSIS
-            TD(λ) on baird with α = 0.01 diverges. ... doubles every 290 updates...
+            TD(0) on baird with α = 0.01 diverges. ... doubles every 290 sweeps...
         """
         sentences = [
-            f"{self.method} on {self.problem} with α = {self.step_size:g}{_settings(self)} {_HEADLINES[self.verdict]}.",
+            f"{_title(self)} on {self.problem} with α = {self.step_size:g}{_settings(self)} "
+            f"{_HEADLINES[self.verdict]}.",
             *_growth(self),
             *_variance(self),
             *_bounds(self),
@@ -178,8 +184,20 @@ def is_poor(error: float | None, best: float | None, scale: float | None, gamma:
     return error > factor * best + 1e-6 * scale
 
 
+_SYMBOLS = {"lambda_": "λ", "beta_over_alpha": "β/α", "eta": "η", "phi": "φ", "tau": "τ", "beta": "β"}
+
+
+def _title(one: Diagnosis) -> str:
+    """The name of the method with its λ filled in: TD(0)."""
+    return one.method.replace("(λ", f"({one.options['lambda_']:g}") if "lambda_" in one.options else one.method
+
+
 def _settings(one: Diagnosis) -> str:
-    given = [f"{name.rstrip('_')} = {value:g}" for name, value in one.options.items() if value != 0]
+    shown = [(name, value) for name, value in one.options.items() if value != 0 and name != "lambda_"]
+    given = [
+        "β = γ" if (name, value) == ("beta", -1.0) else f"{_SYMBOLS.get(name, name)} = {value:g}"
+        for name, value in shown
+    ]
     sampled = {"expected": "", "iid": ", on independent transitions,", "markov": ", along a chain,"}[one.sampling]
     return (f" ({', '.join(given)})" if given else "") + sampled
 
@@ -194,26 +212,28 @@ def _growth(one: Diagnosis) -> list[str]:
         return ["The expected update moves nothing at all."]
     per = "sweep" if one.sampling == "expected" else "update"
     per = f"period of {one.updates} updates" if one.updates > 1 else per
+    unit = "sweeps" if per == "sweep" else "updates"
     radius, turning = one.spectral_radius, " while it swings from side to side" if one.oscillates else ""
     if one.verdict == "chatters" or (one.verdict == "neutral" and one.regions):
         return []
     if one.doubling_time is not None:
         return [
             f"Its leading error is multiplied by {radius:.7g} in every {per}{turning}: "
-            f"it doubles every {one.doubling_time:.3g} updates."
+            f"it doubles every {one.doubling_time:.3g} {unit}."
         ]
     if one.verdict == "neutral":
         return [f"Its leading factor per {per} is {radius:.12g}: an error of that kind stays as large as it is."]
     if radius == 0:
         return [f"The mean error is gone after the first {per}."]
-    halves = one.updates * math.log(2) / -math.log(radius)
-    every = f"it halves every {halves:.3g} updates"
-    return [f"Its slowest error is multiplied by {radius:.7g} in every {per}{turning}: {every}."]
+    text = f"Its slowest error is multiplied by {radius:.7g} in every {per}{turning}"
+    if radius > 0.5:
+        text += f": it halves every {one.updates * math.log(2) / -math.log(radius):.3g} {unit}"
+    return [f"{text}."]
 
 
 def _variance(one: Diagnosis) -> list[str]:
     second = one.second_moment_radius
-    if second is None:
+    if second is None or one.drift > 0:
         return []
     what = "The mean square of its follow-on" if one.follow_on else "The mean square of the weights' error"
     if second >= 1:
@@ -226,14 +246,18 @@ def _variance(one: Diagnosis) -> list[str]:
 
 def _bounds(one: Diagnosis) -> list[str]:
     bound, second, out = one.step_size_bound, one.step_size_bound_second_moment, []
-    if bound is None:
+    if bound is None or one.drift > 0:
         return []
     if bound == 0:
         worst = float(one.rates.real.min(initial=math.inf))
-        reason = f"the matrix of the expected update has an eigenvalue with the real part {min(worst, 0.0):.4g}"
-        if one.spectral_radius < 1 or worst > 0:
+        if one.spectral_radius < 1 or (one.flow and worst > 0):
             out.append("Small step sizes do not converge, so no range from 0 up is safe.")
+        elif not one.flow:
+            out.append("The smallest step sizes do not converge either, so no range from 0 up is safe.")
+        elif one.sampling == "markov":
+            out.append("Smaller steps only diverge more slowly.")
         else:
+            reason = f"the matrix of the expected update has an eigenvalue with the real part {min(worst, 0.0):.4g}"
             out.append(f"No step size helps: {reason}, so smaller steps only diverge more slowly.")
     elif math.isinf(bound):
         out.append("The step size does not matter.")
@@ -246,7 +270,8 @@ def _bounds(one: Diagnosis) -> list[str]:
 
 def _solution(one: Diagnosis) -> list[str]:
     out = []
-    if one.fixed_point_error is not None and one.best_error is not None:
+    rests = bool(one.regions) and one.verdict == "diverges"
+    if one.fixed_point_error is not None and one.best_error is not None and not rests:
         subject = "The fixed point is" if one.converges else "The fixed point, which it does not reach, is"
         error, best = (
             0.0 if x < 1e-9 * max(one.scale or 0.0, 1.0) else x for x in (one.fixed_point_error, one.best_error)
@@ -254,8 +279,8 @@ def _solution(one: Diagnosis) -> list[str]:
         out.append(f"{subject} {error:.4g} (RMS) from the true values; the best weights are {best:.4g} from them.")
     if 0 < one.distance_to_singularity < 1e-3 and one.sampling == "expected":
         out.append(
-            f"The equations for it are nearly singular (σ_min/σ_max = {one.distance_to_singularity:.1e}): "
-            "a small change of the data moves it far."
+            f"The equations for the fixed point are nearly singular (σ_min/σ_max = {one.distance_to_singularity:.1e}): "
+            "a small change of the data may move it far."
         )
     return out
 
@@ -265,14 +290,20 @@ def _pieces(one: Diagnosis) -> list[str]:
         return []
     num = len(one.regions)
     consistent = sum(region.consistent and region.spectral_radius < 1 for region in one.regions)
-    word = "piece" if num == 1 else "pieces"
+    pieces = f"{num}{' or more' if num >= MOST_REGIONS else ''} {'piece' if num == 1 else 'pieces'}"
+    if one.verdict == "diverges" and one.fixed_point is not None:
+        return ["The run rests where it starts, but only there: from weights a little beside it, it grows."]
+    if one.verdict == "diverges" and num == 1:
+        return ["The run grows without ever leaving its first piece."]
     if one.verdict == "diverges":
-        return [f"The run went through {num} {word} and grows without leaving the last one, or in spite of leaving it."]
+        return [f"The run went through {pieces} and grows all the same."]
     if one.verdict == "chatters":
+        holds = f"only {consistent} of them contain" if consistent else "none of them contains"
         return [
-            f"The run went through {num} {word} (greedy policies), of which {consistent} are stable with a fixed point "
-            "of their own: each pulls the weights over the border into another, and they slide along it."
+            f"The run went through {pieces} (greedy policies), and {holds} the point that it would settle at: "
+            "each pulls the weights over the border into another, and they slide along it."
         ]
     if one.verdict == "neutral":
-        return [f"After {num} {word} the run still creeps in one direction, too slowly to tell where it leads."]
-    return [f"The run went through {num} {word} and settles in the last one."]
+        return [f"After {pieces} the run still creeps in one direction, too slowly to tell where it leads."]
+    settles = "stays in the first piece" if num == 1 else f"went through {pieces}"
+    return [f"The run {settles} and settles {'there' if num == 1 else 'in the last one'}."]

@@ -106,7 +106,7 @@ def figure_critical_curves(num_upper: int = 6, num_gammas: int = 9, num_steps: i
         title="How much λ, or φ, the star needs",
         source="Baird 1995 (the star); closed forms derived here",
         caption=f"Expected updates on the star with n = {num_upper}; below γ = (n + 9)/(2n + 5) = {begin:.4f} nothing "
-        "is needed. Dashed: closed form. Triangles: boundary found by scanning eigenvalues. Open circles (errors "
+        "is needed. Dashed, exact: closed form. Triangles: boundary by scanning eigenvalues. Open circles (errors "
         f"fell) and squares (errors grew): {num_steps:,} expected updates at α = 0.01 a little above and below. "
         "Nothing is sampled.",
         panels=tuple(panels),

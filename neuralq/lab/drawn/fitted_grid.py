@@ -13,6 +13,13 @@ from neuralq_envs.counterexamples.continuous import grid_support
 
 __all__ = ["figure_fitted"]
 
+_CASES: tuple[tuple[str, Regressor, float], ...] = (
+    ("quadratic, γ = 1", LeastSquares(), 1.0),
+    ("quadratic, γ = 0.99", LeastSquares(), 0.99),
+    ("nearest neighbour, γ = 1", NearestNeighbours(), 1.0),
+    ("local lines (LWR), γ = 1", LocallyWeighted(0.1), 1.0),
+)
+
 
 def figure_fitted(num_per_side: int = 16, num_iterations: int = 500) -> Drawing:
     """Fitted value iteration on the continuous grid world: a good basis diverges, averages do not.
@@ -30,23 +37,7 @@ def figure_fitted(num_per_side: int = 16, num_iterations: int = 500) -> Drawing:
     """
     model = gridworld()
     support = grid_support(model, num_per_side)
-    cases: list[tuple[str, Regressor, float]] = [
-        ("quadratic, γ = 1", LeastSquares(), 1.0),
-        ("quadratic, γ = 0.99", LeastSquares(), 0.99),
-        ("nearest neighbour, γ = 1", NearestNeighbours(), 1.0),
-        ("local lines (LWR), γ = 1", LocallyWeighted(0.1), 1.0),
-    ]
-    curves, sizes = [], {}
-    for colour, (label, regressor, gamma) in enumerate(cases):
-        # A tolerance that only a sweep without any change meets.
-        ran = fitted_iteration(model, support, regressor, num_iterations=num_iterations, gamma=gamma, tolerance=1e-300)
-        largest = np.pad(ran.max_abs, (0, num_iterations - ran.iterations), mode="edge")  # where nothing moves any more
-        x = np.arange(len(largest), dtype=np.float64)
-        if colour == 2:  # nearest neighbours and lines lie on each other
-            curves.append(Curve(label, x[5::20], largest[5::20], "rings", colour))
-        else:
-            curves.append(Curve(label, x, largest, colour=colour))
-        sizes[label] = float(ran.max_abs[-1])
+    curves, sizes = _curves(num_per_side, num_iterations)
     growth = diagnose_fitted(model, support, LeastSquares()).ray_growth
     top = curves[0]
     if growth is not None and len(top.x) > 60:
@@ -80,3 +71,22 @@ def figure_fitted(num_per_side: int = 16, num_iterations: int = 500) -> Drawing:
         height=3.8,
         known={"growth": float("nan") if growth is None else growth, "exact": exact, **sizes},
     )
+
+
+def _curves(num_per_side: int, num_iterations: int) -> tuple[list[Curve], dict[str, float]]:
+    """Largest |V| after every sweep with each regressor, and after the last."""
+    model = gridworld()
+    support = grid_support(model, num_per_side)
+    curves: list[Curve] = []
+    sizes: dict[str, float] = {}
+    for colour, (label, regressor, gamma) in enumerate(_CASES):
+        # A tolerance that only a sweep without any change meets.
+        ran = fitted_iteration(model, support, regressor, num_iterations=num_iterations, gamma=gamma, tolerance=1e-300)
+        largest = np.pad(ran.max_abs, (0, num_iterations - ran.iterations), mode="edge")  # where nothing moves any more
+        x = np.arange(len(largest), dtype=np.float64)
+        if colour == 2:  # nearest neighbours and lines lie on each other
+            curves.append(Curve(label, x[5::20], largest[5::20], "rings", colour))
+        else:
+            curves.append(Curve(label, x, largest, colour=colour))
+        sizes[label] = float(ran.max_abs[-1])
+    return curves, sizes

@@ -69,7 +69,7 @@ def figure_spiral(step_sizes: tuple[float, ...] = (1e-4, 1e-5)) -> Drawing:
         source="Tsitsiklis & Van Roy 1997",
         caption="ε = 0.05, γ = 0.9, three states in a cycle, all true values 0 (the centre). Left: the values of the "
         "three states in the plane where they sum to 0. Right: θ against time αk; in continuous time it is infinite "
-        f"at t* = {end:.6g}. Dashed: closed form. Points: expected TD(0) updates. Nothing is sampled.",
+        f"at t* = {end:.6g}. Dashed, exact: closed form. Points: expected TD(0) updates. Nothing is sampled.",
         panels=(
             Panel("values", "first coordinate of V", "second coordinate of V", tuple(in_plane), same_units=True,
                   x_limits=(-620, 540), y_limits=(-560, 460), legend="lower left"),

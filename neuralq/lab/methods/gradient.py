@@ -113,7 +113,7 @@ class _TDC:
 
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta, self._ratio = with_helpers(w0), step_ratio(options)
-        self._lambda, self._beta = options["lambda_"], options.get("beta", 0.0)
+        self._lambda, self._beta = options["lambda_"], _regularisation(options)
         self._trace = Trace(w0.shape, self._lambda)
 
     def update(self, sample: Sample, step_size: float) -> None:
@@ -156,6 +156,14 @@ def step_ratio(options: Options) -> float:
     return options["beta_over_alpha"]
 
 
+def _regularisation(options: Options) -> float:
+    """How strongly h is drawn to 0: the β of TDRC, 0 for TDC."""
+    beta = options.get("beta", 0.0)
+    if not beta >= 0:
+        raise ValueError(f"beta must be at least 0, got {beta!r}; 0 is TDC")
+    return beta
+
+
 def dot(a: Floats, b: Floats) -> Floats:
     """The inner product of each seed as a column, ``[N, d] × [N, d] -> [N, 1]``."""
     product: Floats = np.einsum("nd,nd->n", a, b)[:, None]
@@ -185,7 +193,7 @@ def _descent(A: Floats, b: Floats, metric: Floats, ratio: float) -> Expected:
 
 def _expected_tdc(process: Process, options: Options) -> Expected:
     ratio, (A, b) = step_ratio(options), td(process, options["lambda_"])
-    return corrected_flow(A, b, covariance(process), ratio, options.get("beta", 0.0))
+    return corrected_flow(A, b, covariance(process), ratio, _regularisation(options))
 
 
 def _gtd2_mp(process: Process, w0: Floats, options: Options) -> _GTD2:

@@ -25,6 +25,10 @@ __all__ = ["Expected", "Learner", "Method", "Options", "Piece", "flow"]
 
 Floats = NDArray[np.float64]
 Options = Mapping[str, float]
+_LARGEST = 1e100
+"""What every option stays below: its square is still a finite number."""
+_RANGES = {"lambda_": (0, 1), "phi": (0, 1), "eta": (0, _LARGEST), "num_steps": (1, 100_000), "period": (1, 1e9)}
+"""What options of a name mean is the same in every method, and so are their ranges; the rest is up to the method."""
 Piece = tuple[Floats, Floats]  # M [n, n] and c [n] of θ ← M θ + c
 
 
@@ -108,11 +112,15 @@ class Method:
         """The defaults with what was given in their place.
 
         Raises:
-            ValueError: an option that the method does not have.
+            ValueError: an option that the method does not have, or a value that none of that name may have.
         """
         unknown = [name for name in given if name not in self.options]
         if unknown:
             raise ValueError(
                 f"{self.name} has no option {unknown[0]!r}; it has {', '.join(self.options) or 'none'}"
             )  # fmt: skip
+        for name, value in given.items():
+            low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
+            if not low <= value <= high:
+                raise ValueError(f"{name} must lie in [{low:g}, {high:g}], got {value!r}")
         return {**self.options, **given}

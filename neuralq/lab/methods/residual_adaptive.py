@@ -57,8 +57,6 @@ class _ResidualAdaptive:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta = w0.copy()
         self._tracking, self._margin = options["tracking"], _margin(options)
-        check_positive("tracking", self._tracking)
-        check_fraction("tracking", self._tracking)
         self._direct, self._residual = np.zeros_like(w0), np.zeros_like(w0)
 
     def update(self, sample: Sample, step_size: float) -> None:
@@ -71,7 +69,9 @@ class _ResidualAdaptive:
 
 
 def _margin(options: Options) -> float:
-    check_fraction("margin", options["margin"])
+    check_positive("tracking", options["tracking"])
+    for name in ("tracking", "margin"):
+        check_fraction(name, options[name])
     return options["margin"]
 
 
