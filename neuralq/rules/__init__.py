@@ -7,10 +7,25 @@ axes, time first (``[T, *n]``) for returns; action values are ``[*n, A]`` with -
 
 from __future__ import annotations
 
+from neuralq.rules.distributional import (
+    categorical_cross_entropy,
+    categorical_projection,
+    quantile_huber,
+    quantile_levels,
+)
 from neuralq.rules.episodes import forward_episode_update, reverse_episode_update
 from neuralq.rules.losses import huber, residual_gradient_error, semi_gradient_error, squared
+from neuralq.rules.munchausen import munchausen, munchausen_bonus, soft_value
 from neuralq.rules.policies import epsilon_greedy, greedy, greedy_random_ties, k_to_the_q, sample, softmax
-from neuralq.rules.returns import is_greedy, lambda_returns, n_step_returns, watkins_lambda
+from neuralq.rules.returns import (
+    is_greedy,
+    lambda_returns,
+    n_step_returns,
+    off_policy_returns,
+    retrace_coefficients,
+    tree_backup_coefficients,
+    watkins_lambda,
+)
 from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
 from neuralq.rules.targets import (
     double_q,
@@ -30,6 +45,8 @@ __all__ = [
     "Power",
     "Schedule",
     "accumulate",
+    "categorical_cross_entropy",
+    "categorical_projection",
     "cut",
     "double_q",
     "dutch",
@@ -43,17 +60,25 @@ __all__ = [
     "is_greedy",
     "k_to_the_q",
     "lambda_returns",
+    "munchausen",
+    "munchausen_bonus",
     "n_step_returns",
+    "off_policy_returns",
     "one_step",
     "q_learning",
+    "quantile_huber",
+    "quantile_levels",
     "replace",
     "residual_gradient_error",
+    "retrace_coefficients",
     "reverse_episode_update",
     "sample",
     "sarsa",
     "semi_gradient_error",
+    "soft_value",
     "softmax",
     "squared",
+    "tree_backup_coefficients",
     "true_online_increment",
     "watkins_lambda",
     "weighted_value",

@@ -17,6 +17,10 @@ Three things end a return, and each has its own place:
 
 λ_t belongs to the mixing of row t with row t+1, so an exploring action cuts in the row *before* the one that took it.
 Peng's Q(λ) does not cut at all (`lambda_t` a constant); Watkins' does (`watkins_lambda`).
+
+Under a behaviour policy μ that is not the target policy π, `off_policy_returns` corrects instead of cutting: the
+errors ``δ_t = r_t + discount_t · E_π q_t − q_tm1[a_tm1]`` of the rows that follow are added, each times the product of
+coefficients c of the actions on the way there. Retrace, tree backup and Q(λ) differ in c alone.
 """
 
 from __future__ import annotations
@@ -28,7 +32,15 @@ from neuralq.checks import check_fraction, check_whole
 from neuralq.rules.shapes import check_actions, check_same_shape, check_time_major
 from neuralq.rules.targets import weighted_value
 
-__all__ = ["is_greedy", "lambda_returns", "n_step_returns", "watkins_lambda"]
+__all__ = [
+    "is_greedy",
+    "lambda_returns",
+    "n_step_returns",
+    "off_policy_returns",
+    "retrace_coefficients",
+    "tree_backup_coefficients",
+    "watkins_lambda",
+]
 
 
 def lambda_returns(r_t: Tensor, discount_t: Tensor, v_t: Tensor, lambda_t: Tensor | float, last_t: Tensor) -> Tensor:
@@ -169,6 +181,99 @@ def watkins_lambda(lambda_: float, greedy_tm1: Tensor, dtype: torch.dtype = torc
     lambda_t = torch.zeros(greedy_tm1.shape, dtype=dtype, device=greedy_tm1.device)
     lambda_t[:-1].masked_fill_(greedy_tm1[1:], lambda_)
     return lambda_t
+
+
+def off_policy_returns(
+    q_tm1: Tensor, r_t: Tensor, discount_t: Tensor, v_t: Tensor, c_tm1: Tensor, last_t: Tensor
+) -> Tensor:
+    """Off-policy returns add the errors of later rows as far as the coefficients carry: ``G_t = q_tm1 + Δ_t``.
+
+    ``Δ_t = δ_t + discount_t · c_{t+1} · Δ_{t+1}`` and ``δ_t = r_t + discount_t · v_t − q_tm1``, where c_{t+1} belongs
+    to the action of the *next* row. A row's own coefficient never touches its own return: its action is given.
+
+    Args:
+        q_tm1: Q(s_tm1, a_tm1) of every row, time-major ``[T, *n]``.
+        r_t: rewards, ``[T, *n]``.
+        discount_t: γ, or 0 where the world terminated, ``[T, *n]``.
+        v_t: E_π Q of each row's successor, ``[T, *n]``; -∞ is harmless where ``discount_t`` is 0.
+        c_tm1: coefficient of the action ``a_tm1`` of every row, *not* shifted, ``[T, *n]``: `retrace_coefficients`,
+            `tree_backup_coefficients`, λ throughout (Q(λ) of Harutyunyan et al.: safe for π near μ only), λ where the
+            action is greedy and 0 elsewhere (Watkins), π/μ (importance sampling).
+        last_t: where the stream breaks, ``[T, *n]``, bool; nothing is carried over a break or the rollout's edge.
+
+    Returns:
+        ``[T, *n]``. With c = 0 these are one-step targets.
+
+    Raises:
+        ValueError: if shapes differ, T is 0 or ``last_t`` is not bool.
+
+    Source: Munos et al. 2016, eq. 3 and 4, of which Harutyunyan et al. 2016, Precup et al. 2000 are cases.
+
+    Example:
+        δ = (1, 1, 1); the coefficient of the middle row is ½, that of the last row 0.
+
+        >>> one, zero = torch.ones(3), torch.zeros(3)
+        >>> off_policy_returns(zero, one, one, zero, torch.tensor([9.0, 0.5, 0.0]), zero > 0)
+        tensor([1.5000, 1.0000, 1.0000])
+    """
+    check_time_major(r_t, discount_t, v_t, last_t)
+    check_same_shape("q_tm1", q_tm1, "r_t", r_t)
+    check_same_shape("c_tm1", c_tm1, "r_t", r_t)
+    delta = r_t + weighted_value(discount_t, v_t) - q_tm1
+    # The last row's own coefficient stands in for that of the row after it, which is masked out with every break.
+    following = torch.cat([c_tm1[1:], c_tm1[-1:]])
+    carry = (discount_t * following).masked_fill(_breaks(last_t), 0.0)
+    return q_tm1 + _accumulate_backwards(delta, carry)
+
+
+def retrace_coefficients(lambda_: float, pi_tm1: Tensor, mu_tm1: Tensor) -> Tensor:
+    """Retrace follows an action as far as the target policy would: ``c = λ · min(1, π/μ)``.
+
+    Safe for every π and μ, and as far-reaching as safety allows: where π = μ nothing is cut.
+
+    Args:
+        lambda_: in [0, 1].
+        pi_tm1: probability of each row's action under the target policy, ``[T, *n]``.
+        mu_tm1: and under the policy that took it, ``[T, *n]``, above 0.
+
+    Returns:
+        ``[T, *n]`` in the dtype of ``pi_tm1``, for `off_policy_returns`.
+
+    Raises:
+        ValueError: if ``lambda_`` is outside [0, 1] or the shapes differ.
+
+    Source: Munos et al. 2016, section 3.2.
+
+    Example:
+        >>> retrace_coefficients(0.5, torch.tensor([0.1, 0.8]), torch.tensor([0.4, 0.4]))
+        tensor([0.1250, 0.5000])
+    """
+    check_fraction("lambda_", lambda_)
+    check_same_shape("mu_tm1", mu_tm1, "pi_tm1", pi_tm1)
+    return lambda_ * (pi_tm1 / mu_tm1.to(pi_tm1.dtype)).clamp(max=1.0)
+
+
+def tree_backup_coefficients(lambda_: float, pi_tm1: Tensor) -> Tensor:
+    """Tree backup follows an action in proportion to its target probability: ``c = λ · π``, whatever the behaviour.
+
+    Args:
+        lambda_: in [0, 1].
+        pi_tm1: probability of each row's action under the target policy, ``[T, *n]``.
+
+    Returns:
+        ``[T, *n]``, for `off_policy_returns`.
+
+    Raises:
+        ValueError: if ``lambda_`` is outside [0, 1].
+
+    Source: Precup, Sutton & Singh 2000, section 3; Munos et al. 2016, table 1.
+
+    Example:
+        >>> tree_backup_coefficients(0.5, torch.tensor([0.5, 1.0]))
+        tensor([0.2500, 0.5000])
+    """
+    check_fraction("lambda_", lambda_)
+    return lambda_ * pi_tm1
 
 
 def _breaks(last_t: Tensor) -> Tensor:
