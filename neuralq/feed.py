@@ -239,6 +239,7 @@ class OnlineFeed:
 
     def __init__(self, num_lanes: int, spec: ObservationSpec) -> None:
         self._rows = _Rows(1, num_lanes, spec)
+        self._row = self._rows.transition.map(lambda x: x[0])  # views, made once: this is asked for at every step
         self._fresh = False
 
     def add(self, step: Step) -> None:
@@ -251,8 +252,7 @@ class OnlineFeed:
         if self._fresh:
             self._fresh = False
             held = self._rows.held[0]
-            row = self._rows.transition.map(lambda x: x[0])
-            yield Sample(row, None if held.all() else torch.from_numpy(held))
+            yield Sample(self._row, None if held.all() else torch.from_numpy(held))
 
     def return_errors(self, sample: Sample, errors: Tensor) -> None:
         """Steps are learned from once."""

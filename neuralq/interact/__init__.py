@@ -8,18 +8,22 @@ restart to the caller, who asks for it here. Each lane's experience is the same 
 
 from __future__ import annotations
 
-from neuralq.interact.lanes import Lane, LaneFault, make_vector_env
+from neuralq.interact.lanes import MASK_METHODS, Lane, LaneFault, legal_actions, make_vector_env
+from neuralq.interact.normalisation import Normalisation
 from neuralq.interact.stream import EnvironmentFault, Episode, Interaction, ObservationSpec, Policy, Step, interact
 
 __all__ = [
+    "MASK_METHODS",
     "EnvironmentFault",
     "Episode",
     "Interaction",
     "Lane",
     "LaneFault",
+    "Normalisation",
     "ObservationSpec",
     "Policy",
     "Step",
     "interact",
+    "legal_actions",
     "make_vector_env",
 ]

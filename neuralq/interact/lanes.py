@@ -14,7 +14,37 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from neuralq.checks import check_whole
 from neuralq.features import encoder_for
 
-__all__ = ["Lane", "LaneFault", "make_vector_env"]
+__all__ = ["MASK_METHODS", "Lane", "LaneFault", "legal_actions", "make_vector_env"]
+
+MASK_METHODS = ("action_masks", "valid_action_mask")
+"""Methods by which environments tell their legal actions, for those that do not put them into info."""
+
+
+def legal_actions(env: gym.Env[Any, Any], info: Mapping[str, Any]) -> Any:
+    """The action mask of where an environment stands: of ``info``, else by a method of its own, else None.
+
+    Args:
+        env: a single environment, wrapped or not, with one of `MASK_METHODS` or none.
+        info: of its last reset or step.
+
+    Example:
+        >>> env = gym.make("CartPole-v1")
+        >>> legal_actions(env, {}) is None, legal_actions(env, {"action_mask": [1, 0]})
+        (True, [1, 0])
+    """
+    if "action_mask" in info:
+        return info["action_mask"]
+    method = _mask_method(env)
+    return None if method is None else method()
+
+
+def _mask_method(env: gym.Env[Any, Any]) -> Callable[[], Any] | None:
+    for name in MASK_METHODS:
+        if env.has_wrapper_attr(name):
+            found: Callable[[], Any] = env.get_wrapper_attr(name)
+            if callable(found):
+                return found
+    return None
 
 
 class LaneFault(RuntimeError):
@@ -31,6 +61,8 @@ class Lane(gym.Wrapper[Any, Any, Any, Any]):
     Copying matters under SAME_STEP: an environment that reuses its observation array would overwrite the true successor
     with the next episode's first observation before anybody could read it. Checking matters because a batch casts what
     it is given to the space's dtype without a word, and says nothing of the index where the shape is wrong.
+
+    Legal actions that the environment tells by a method (`MASK_METHODS`) are put into ``info["action_mask"]``.
     """
 
     def __init__(self, env: gym.Env[Any, Any], index: int) -> None:
@@ -41,6 +73,7 @@ class Lane(gym.Wrapper[Any, Any, Any, Any]):
         self._shape = space.shape if isinstance(space, spaces.Box) else None
         self._dtype = space.dtype
         self._whole = isinstance(space, spaces.Discrete)
+        self._mask_method = _mask_method(env)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """As the environment's own, with a copied observation and the reward as a float."""
@@ -52,7 +85,7 @@ class Lane(gym.Wrapper[Any, Any, Any, Any]):
             r_t = float(reward)
         except Exception as error:
             raise LaneFault(self.index, f": reward must be a number, got {reward!r}") from error
-        return self._checked(observation), r_t, terminated, truncated, info
+        return self._checked(observation), r_t, terminated, truncated, self._with_mask(info)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """As the environment's own, with a copied observation."""
@@ -60,7 +93,16 @@ class Lane(gym.Wrapper[Any, Any, Any, Any]):
             observation, info = self.env.reset(seed=seed, options=options)
         except Exception as error:
             raise self._raised(error) from error
-        return self._checked(observation), info
+        return self._checked(observation), self._with_mask(info)
+
+    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
+        """What the environment says of its legal actions where ``info`` looks for it; ``info`` wins if both speak."""
+        if self._mask_method is None or "action_mask" in info:
+            return info
+        try:
+            return {**info, "action_mask": np.asarray(self._mask_method())}
+        except Exception as error:
+            raise self._raised(error) from error
 
     def _raised(self, error: Exception) -> LaneFault:
         return LaneFault(self.index, f" raised {type(error).__name__}: {error}")

@@ -14,6 +14,7 @@ from torch import Tensor
 from neuralq.checks import check_discount
 from neuralq.features import Encoder, ObservationError, discrete_actions, encoder_for
 from neuralq.interact.lanes import Lane, LaneFault
+from neuralq.interact.normalisation import Normalisation
 from neuralq.types import Transition
 
 __all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
@@ -93,16 +94,23 @@ class Interaction:
         discount: γ in [0, 1].
         seed: of the first reset; None continues the environments' own randomness.
         as_index: encode finite observations as one index, for tables.
+        normalisation: through which observations and the rewards of transitions are seen; episode returns are not.
 
     Raises:
         ValueError: for spaces that cannot be learned from and environments that do not say how they restart.
     """
 
     def __init__(
-        self, envs: VectorEnv[Any, Any, Any], discount: float, seed: int | None, as_index: bool = False
+        self,
+        envs: VectorEnv[Any, Any, Any],
+        discount: float,
+        seed: int | None,
+        as_index: bool = False,
+        normalisation: Normalisation | None = None,
     ) -> None:
         check_discount("discount", discount)
         self.envs = envs
+        self.normalisation = normalisation
         self.num_envs: int = envs.num_envs
         self.discount = float(discount)
         self.encoder: Encoder = encoder_for(envs.single_observation_space, as_index=as_index)
@@ -153,6 +161,8 @@ class Interaction:
             encoded = self.encoder.encode(observation)
         except ObservationError as error:
             raise self._fault(str(error)) from error
+        if self.normalisation is not None:
+            encoded = self.normalisation.observe(encoded, lanes)
         if self._mask is None and "action_mask" in info:
             if self._begun:
                 raise self._fault("field info['action_mask']: given now but not at the first reset; give it always")
@@ -190,8 +200,7 @@ class Interaction:
     def _with_mask(self, encoded: _Array) -> _Array:
         assert self._mask is not None
         flat = encoded.reshape(len(encoded), -1)
-        dtype = np.int64 if self.encoder.num_categories is not None else np.float32
-        return np.concatenate([flat.astype(dtype), self._mask.astype(dtype)], axis=1)
+        return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
 
     def _fault(self, what: str) -> EnvironmentFault:
         self._broken = True
@@ -227,6 +236,8 @@ class Interaction:
         lanes = self._everyone if everyone else np.flatnonzero(~fake)
         discount_t = np.where(terminated, 0.0, self.discount)
         rows: tuple[_Array, ...] = (self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last)
+        if self.normalisation is not None:
+            rows = (*rows[:3], self.normalisation.reward(r_t, last, ~fake), *rows[4:])
         if not everyone:
             rows = tuple(row[lanes] for row in rows)
             r_t = np.where(fake, 0, r_t)
@@ -265,6 +276,8 @@ class Interaction:
                 encoded = self.encoder.encode_single(info["final_obs"][lane], lane=int(lane))
             except ObservationError as error:
                 raise self._fault(str(error)) from error
+            if self.normalisation is not None:
+                encoded = self.normalisation.observe(np.asarray(encoded)[None])[0]
             rows[lane, : encoded.size] = np.reshape(encoded, -1)
         if self._mask is not None:
             successors[ended, -self.num_actions :] = self._legal(info.get("final_info", {}), ended, terminated)
@@ -299,6 +312,7 @@ class Interaction:
             "lengths": self._lengths,
             "pending": self._pending,
             "mask": self._mask,
+            "normalisation": None if self.normalisation is None else self.normalisation.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -309,6 +323,12 @@ class Interaction:
         self._lengths = np.array(state["lengths"])
         self._pending = np.array(state["pending"])
         self._mask = None if state["mask"] is None else np.array(state["mask"])
+        self.load_normalisation(state)
+
+    def load_normalisation(self, state: Mapping[str, Any]) -> None:
+        """Of `state_dict`, the statistics alone: they stay true where the episodes have to start anew."""
+        if self.normalisation is not None:
+            self.normalisation.load_state_dict(state["normalisation"])
 
 
 def _describe_error(error: Exception) -> str:

@@ -5,9 +5,9 @@ A small network on a CPU is bound by the framework's cost per operation, not by 
 tests/test_engine.py for every layout, loss, activation and normalisation.
 
 The network is described by ``plan``, one row per layer: fan_in, fan_out, and the offsets in the flat vector of weight
-``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none). Workspaces
-hold for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the normalised pre-activation,
-``deltas`` the gradient with respect to it; ``inverse`` holds 1/σ of each row.
+``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none, −2: one without
+scale and shift). Workspaces hold for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the
+normalised pre-activation, ``deltas`` the gradient with respect to it; ``inverse`` holds 1/σ of each row.
 
 The two entries call `_forward` and `_backward` in one place each, whatever the layout: every further call is inlined
 and compiled again, and that was half of the seconds that the first use on a machine takes.
@@ -54,10 +54,16 @@ def _normalise_rows(y: _Array, scale: _Array, shift: _Array, hat: _Array, invers
             spread += (y[i, j] - mean) * (y[i, j] - mean)
         inv = y.dtype.type(1.0 / math.sqrt(spread / width + _LAYER_NORM_EPS))
         inverse[i] = inv
-        for j in range(width):
-            h = (y[i, j] - mean) * inv
-            hat[i, j] = h
-            y[i, j] = h * scale[j] + shift[j]
+        if scale.size > 0:
+            for j in range(width):
+                h = (y[i, j] - mean) * inv
+                hat[i, j] = h
+                y[i, j] = h * scale[j] + shift[j]
+        else:
+            for j in range(width):
+                h = (y[i, j] - mean) * inv
+                hat[i, j] = h
+                y[i, j] = h
         if activation == 0:
             for j in range(width):
                 y[i, j] = y.dtype.type(0) if y[i, j] <= 0 else y[i, j]  # NaN stays
@@ -91,7 +97,7 @@ def _forward(
         y = acts[block : block + rows * fan_out].reshape(rows, fan_out)
         np.dot(h, weight, y)
         last = layer == num_layers - 1
-        if last or activation != 0 or plan[layer, 4] >= 0:
+        if last or activation != 0 or plan[layer, 4] != -1:
             for i in range(rows):
                 for j in range(fan_out):
                     y[i, j] += bias[j]
@@ -101,11 +107,12 @@ def _forward(
                     v = y[i, j] + bias[j]
                     y[i, j] = params.dtype.type(0) if v <= 0 else v  # NaN stays
         if not last:
-            if plan[layer, 4] >= 0:
-                at = plan[layer, 4] + copy * fan_out
-                scale = params[at : at + fan_out]
-                at = plan[layer, 5] + copy * fan_out
-                shift = params[at : at + fan_out]
+            if plan[layer, 4] != -1:
+                width = fan_out if plan[layer, 4] >= 0 else 0  # of scale and shift
+                at = max(plan[layer, 4], 0) + copy * width
+                scale = params[at : at + width]
+                at = max(plan[layer, 5], 0) + copy * width
+                shift = params[at : at + width]
                 hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
                 _normalise_rows(y, scale, shift, hat, inverse[rows * layer : rows * (layer + 1)], activation)
             elif activation != 0:
@@ -141,14 +148,14 @@ def _through_norm(
     for i in range(rows):
         mean = d[i, 0] * 0
         along = d[i, 0] * 0
+        if scale.size > 0:
+            for j in range(width):
+                grad_shift[j] += d[i, j]
+                grad_scale[j] += d[i, j] * hat[i, j]
+                d[i, j] *= scale[j]
         for j in range(width):
-            grad_shift[j] += d[i, j]
-            grad_scale[j] += d[i, j] * hat[i, j]
-        for j in range(width):
-            g = d[i, j] * scale[j]
-            d[i, j] = g
-            mean += g
-            along += g * hat[i, j]
+            mean += d[i, j]
+            along += d[i, j] * hat[i, j]
         mean /= d.dtype.type(width)
         along /= d.dtype.type(width)
         inv = inverse[i]
@@ -179,14 +186,15 @@ def _backward(
         d = deltas[block : block + rows * fan_out].reshape(rows, fan_out)
         if layer < num_layers - 1:
             _through_activation(d, acts[block : block + rows * fan_out].reshape(rows, fan_out), activation)
-            if plan[layer, 4] >= 0:
-                at = plan[layer, 4] + copy * fan_out
-                scale = params[at : at + fan_out]
-                grad_scale = grads[at : at + fan_out]
-                at = plan[layer, 5] + copy * fan_out
+            if plan[layer, 4] != -1:
+                width = fan_out if plan[layer, 4] >= 0 else 0
+                at = max(plan[layer, 4], 0) + copy * width
+                scale = params[at : at + width]
+                grad_scale = grads[at : at + width]
+                at = max(plan[layer, 5], 0) + copy * width
                 hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
                 row_inverse = inverse[rows * layer : rows * (layer + 1)]
-                _through_norm(d, hat, row_inverse, scale, grad_scale, grads[at : at + fan_out])
+                _through_norm(d, hat, row_inverse, scale, grad_scale, grads[at : at + width])
         at = plan[layer, 3] + copy * fan_out
         grad_bias = grads[at : at + fan_out]
         for i in range(rows):
