@@ -164,6 +164,8 @@ class DQRCLearner:
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One step of both functions on a batch; ``weight`` ``[B]`` multiplies each sample's losses."""
         s, a, dtype = transition.s_tm1, transition.a_tm1, self.engine.flat.values.dtype
+        if isinstance(self.engine.q, MaskedQ):
+            self.engine.q.check_legal(s, a, weight)
         q = self.engine.q.at(s, a)
         h = self.head.at(s, a)
         v_t = greedy_value(self.engine.q.all(transition.s_t))

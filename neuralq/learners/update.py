@@ -88,11 +88,15 @@ class Descent:
     def step(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, scale: float = 1.0) -> Tensor:
         """One step on the weighted loss; returns the errors before it, ``[B]``."""
         errors = self.engine.loss_gradient(s, a, target, weight)
+        self.follow(scale)
+        return errors
+
+    def follow(self, scale: float = 1.0) -> None:
+        """One step along the gradient that lies in the engine's flat vector, wherever it came from."""
         grad = self.engine.flat.grad
         if self.max_grad_norm is not None:
             clip_norm_(grad, self.max_grad_norm)
         self._state.step(grad, self.learning_rate * scale)
-        return errors
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, their target copy and the optimiser."""

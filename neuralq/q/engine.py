@@ -59,7 +59,8 @@ class Engine(Protocol):
         """Errors target − Q(s, a) ``[*n]``; leaves the mean loss's gradient in ``flat.grad``.
 
         Raises:
-            ValueError: if ``target`` or ``weight`` is not of the actions' shape, or an action does not exist.
+            ValueError: if ``target`` or ``weight`` is not of the actions' shape, or an action does not exist, or is
+                illegal by its state's mask in a row whose weight is not 0 (looked at on CPUs only).
         """
         ...
 
@@ -94,31 +95,43 @@ class TorchEngine:
     @torch.no_grad()
     def all(self, s: Tensor, target: bool = False) -> Tensor:
         """Action values without gradient, of the target copy if asked for."""
-        if target and self._target is None:
-            raise _no_target()
         # Acting comes with observations from the CPU, wherever the parameters live.
-        return cast(QFunction, self._target if target else self.q).all(s.to(self.flat.values.device))
+        return self.network(target).all(s.to(self.flat.values.device))
 
     def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
         _check_samples(a, target, weight)
         _check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
-        error = target.to(self.flat.values.dtype) - self.q.at(s, a)
+        error = target.to(self.flat.values.dtype) - self._legal_at(s, a, weight)
         each = (
             rules.squared(error, weight) if self.loss.kind == "squared" else rules.huber(error, self.loss.delta, weight)
         )
         each.mean().backward()  # type: ignore[no-untyped-call]
         return error.detach()
 
+    def _legal_at(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Q(s, a) of legal actions; where a row's weight is 0 any number will do, but −∞ times 0 would be NaN."""
+        if not isinstance(self.q, MaskedQ):
+            return self.q.at(s, a)
+        self.q.check_legal(s, a, weight)
+        q = self.q.at(s, a)
+        return q if weight is None else q.masked_fill(torch.isneginf(q) & (weight == 0), 0.0)
+
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
         _check_single(a)
         _check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
-        q = self.q.at(s, a)
+        q = self._legal_at(s, a)
         q.backward()  # type: ignore[no-untyped-call]
         return q.detach()
+
+    def network(self, target: bool = False) -> QFunction:
+        """The module itself, or its target copy, for learners that need more of it than action values."""
+        if target and self._target is None:
+            raise _no_target()
+        return cast(QFunction, self._target) if target else self.q
 
     def sync_target(self) -> None:
         """Copy the parameters into the target copy."""
@@ -264,6 +277,7 @@ class MlpEngine:
     def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
         _check_samples(a, target, weight)
+        self._check_legal(s, a, weight)
         wanted = target.to(self._dtype).reshape(-1).numpy()
         weights = None if weight is None else weight.to(self._dtype).reshape(-1).numpy()
         return torch.from_numpy(wanted - self._pull(s, a, wanted, weights, self._loss)).view(a.shape)
@@ -271,7 +285,13 @@ class MlpEngine:
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
         _check_single(a)
+        self._check_legal(s, a)
         return torch.from_numpy(self._pull(s, a, None, None, kernels.VALUE))[0]
+
+    def _check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
+        if self._mask is not None:
+            _check_actions(a, self._num_actions)
+            self._mask.check_legal(s, a, weight)
 
     def sync_target(self) -> None:
         """Copy the parameters into the target copy."""
@@ -296,7 +316,10 @@ def _plan_of(net: Any, flat: FlatParameters) -> tuple[Any, Any]:
     for i, layer in enumerate(net.trunk.layers):
         _, fan_in, fan_out = layer.weight.shape
         norm = net.trunk.norms[i] if i < len(net.trunk.norms) else None
-        scale, shift = (-1, -1) if norm is None else (offset(norm.weight), offset(norm.bias))
+        # −1: no normalisation; −2: one without scale and shift.
+        scale, shift = (-1, -1) if norm is None else (-2, -2)
+        if norm is not None and norm.weight is not None:
+            scale, shift = offset(norm.weight), offset(norm.bias)
         plan.append((fan_in, fan_out, offset(layer.weight), offset(layer.bias), scale, shift))
     table = np.array(plan, dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(table[:-1, 1])]).astype(np.int64)

@@ -62,3 +62,35 @@ class MaskedQ(nn.Module):
         """Values of the given actions, −∞ where illegal: ``([*n, d + A], [*n] int64) -> [*n]``."""
         q = self.inner.at(self.observation(s), a)
         return q.masked_fill(self.illegal(s).gather(-1, a[..., None])[..., 0], -torch.inf)
+
+    def check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
+        """Experience holds no illegal action, whose value −∞ nothing can be learned from.
+
+        Rows of weight 0 are no experience and may hold anything. Devices other than the CPU are not asked, for that
+        would mean waiting for them: there an illegal action shows as parameters that are not finite.
+
+        Args:
+            s: observations with their masks, ``[*n, d + A]``.
+            a: actions that exist, ``[*n]`` int64.
+            weight: ``[*n]``, or None for 1.
+
+        Raises:
+            ValueError: naming the first such row.
+
+        Example:
+            >>> from neuralq.q import TableQ
+            >>> MaskedQ(TableQ(3, 2), ()).check_legal(torch.tensor([2, 1, 0]), torch.tensor(1))
+            Traceback (most recent call last):
+            ValueError: action 1 is illegal in row 0 of 1 ...
+        """
+        if s.device.type != "cpu":
+            return
+        wrong = self.illegal(s).gather(-1, a[..., None])[..., 0].reshape(-1)
+        if weight is not None:
+            wrong = wrong & (weight.reshape(-1) != 0)
+        if wrong.any():
+            row = int(wrong.nonzero()[0, 0])
+            raise ValueError(
+                f"action {int(a.reshape(-1)[row])} is illegal in row {row} of {a.numel()} by the mask of its state; "
+                "choose only actions that the mask allows, or let the environment's mask allow what it executes"
+            )
