@@ -1,6 +1,6 @@
 """Observation spaces to arrays: what an environment hands out becomes what a value function takes.
 
-Two targets. *Arrays* for networks and linear features: a `Box` stays as it is (float32; images stay uint8), a
+Two targets. *Arrays* for networks and linear features: a `Box` stays as it is (float32; frames keep uint8 or bool), a
 `Discrete` becomes a state index that `OneHot` widens inside the network, everything composite becomes one flat float32
 vector with a one-hot block for each discrete part, in the order of `gymnasium.spaces.utils.flatten`. *Indices* for
 tables: every finite space becomes one whole number in mixed radix, the first part the most significant digit.
@@ -30,7 +30,7 @@ MAX_TABLE_STATES = 10_000_000
 """The most states that a table is built for; beyond it a table is no longer the right representation."""
 
 _Array = np.ndarray[Any, np.dtype[Any]]
-_FLOAT, _WHOLE, _BINARY = "f", "iu", "biu"
+_FLOAT, _WHOLE, _BINARY, _FRAMES = "f", "iu", "biu", (np.uint8, np.bool_)
 _KIND_WORDS = {_FLOAT: "floating-point", _WHOLE: "whole-number", _BINARY: "0/1", "b": "boolean"}
 
 
@@ -105,9 +105,9 @@ class _Part:
             raise ObservationError(
                 f"must have shape [{shape}], got {list(array.shape)}{way_out}", field=_name(self.keys)
             )
-        exact = self.dtype == np.uint8 and self.sizes is None
-        if array.dtype.kind not in self.kinds or (exact and array.dtype != np.uint8):
-            wanted = "uint8" if exact else f"{_KIND_WORDS[self.kinds]} (its space says {self.dtype})"
+        exact = self.dtype in _FRAMES and self.sizes is None
+        if array.dtype.kind not in self.kinds or (exact and array.dtype != self.dtype):
+            wanted = str(self.dtype) if exact else f"{_KIND_WORDS[self.kinds]} (its space says {self.dtype})"
             way_out = "make the environment return what its observation_space declares"
             raise ObservationError(f"must be {wanted}, got dtype {array.dtype}; {way_out}", field=_name(self.keys))
         return array
@@ -161,7 +161,7 @@ class Encoder:
 
     Args:
         shape: shape of one encoded observation, without the lane axis.
-        dtype: float32, uint8 (images) or int64 (state indices).
+        dtype: float32, uint8 or bool (frames) or int64 (state indices).
         num_categories: number of states when the encoded observation is a state index (shape ``()``), else None.
     """
 
@@ -259,8 +259,8 @@ def encoder_for(space: Space[Any], *, as_index: bool = False) -> Encoder:
     if isinstance(space, spaces.Discrete):
         return Encoder((), np.dtype(np.int64), int(space.n), "index", parts)
     if isinstance(space, spaces.Box):
-        if parts[0].dtype == np.uint8 and len(space.shape) >= 2:
-            return Encoder(space.shape, np.dtype(np.uint8), None, "image", parts)
+        if parts[0].dtype in _FRAMES and len(space.shape) >= 2:
+            return Encoder(space.shape, parts[0].dtype, None, "image", parts)
         return Encoder(space.shape, np.dtype(np.float32), None, "array", parts)
     width = sum(part.width for part in parts)
     return Encoder((width,), np.dtype(np.float32), None, "vector", parts)

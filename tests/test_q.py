@@ -313,7 +313,7 @@ def test_bad_input_is_refused_clearly() -> None:
         with pytest.raises(ValueError, match="num_actions must be a whole number of at least 1, got 0"):
             layout((4,), 0)
         with pytest.raises(
-            ValueError, match=r"Conv body needs observations \[channels, height, width\], got shape \(4,\)"
+            ValueError, match=r"Conv body needs frames \[height, width, channels\], .* got shape \(4,\)"
         ):
             layout((4,), 2, Conv())
         with pytest.raises(ValueError, match="does not fit"):

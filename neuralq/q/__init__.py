@@ -5,7 +5,9 @@ actions named, and the second always equals the first gathered at ``a``. What di
 moves along with the one it was meant for, and that is what decides whether training converges.
 """
 
-from neuralq.q.bodies import MLP, Conv
+from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
+from neuralq.q.distributional import CategoricalQ, QuantileQ
+from neuralq.q.dueling import DuelingQ
 from neuralq.q.exact_case import LinearQ, TableQ
 from neuralq.q.flat import FlatParameters
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
@@ -13,12 +15,17 @@ from neuralq.q.masked import MaskedQ
 
 __all__ = [
     "MLP",
+    "NAMED_BODIES",
     "ActionInputQ",
     "ActionOutputQ",
+    "CategoricalQ",
     "Conv",
+    "DuelingQ",
     "FlatParameters",
     "LinearQ",
     "MaskedQ",
+    "QuantileQ",
     "SeparateQ",
     "TableQ",
+    "body_for",
 ]

@@ -5,13 +5,19 @@ that turns an observation into a vector (nothing for the MLP, convolutions for `
 Both are built with a leading axis of ``copies`` networks that share nothing: `SeparateQ` asks for one copy per action
 and still runs as one batched product per layer.
 
-Weights start as U(±1/√fan_in), biases likewise, drawn from the caller's generator.
+Weights start as U(±1/√fan_in), biases likewise, drawn from the caller's generator; with ``init="he"`` they start normal
+with variance 2/fan_in below an activation and 1/fan_in in the last layer, biases at zero (He et al., 2015). With a
+``sparsity`` that fraction of the inputs of every unit starts at zero and all biases do (Elsayed, Vasan & Mahmood 2024),
+which keeps units apart where steps are large and there is no replay.
+
+Frames come as ``[H, W, C]``, ``[C, H, W]`` or ``[H, W]`` and are stored that way; `Conv` finds out, or is told, where
+the channels are, and turns them inside the network.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,24 +25,70 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_choice, check_whole
+from neuralq.q.frames import channels_first
 
-__all__ = ["ACTIVATIONS", "MLP", "Conv", "GroupedConv", "GroupedLayerNorm", "GroupedLinear", "Trunk"]
+__all__ = [
+    "ACTIVATIONS",
+    "MLP",
+    "NAMED_BODIES",
+    "Conv",
+    "GroupedConv",
+    "GroupedLayerNorm",
+    "GroupedLinear",
+    "Trunk",
+    "body_for",
+]
 
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.functional.leaky_relu}
 
 
-def _uniform(rng: np.random.Generator, shape: tuple[int, ...], fan_in: int, dtype: torch.dtype) -> nn.Parameter:
+_INITS = ("uniform", "he")
+_HE, _LAST = 2.0, 1.0  # times 1/fan_in: rectified units halve the variance, and above the last layer there are none
+
+
+def _weight(
+    rng: np.random.Generator, shape: tuple[int, ...], fan_in: int, dtype: torch.dtype, gain: float | None
+) -> nn.Parameter:
+    """Normal with variance gain / fan_in, or uniform where there is no gain."""
     bound = 1.0 / math.sqrt(fan_in)
-    return nn.Parameter(torch.from_numpy(rng.uniform(-bound, bound, shape)).to(dtype))
+    drawn = rng.uniform(-bound, bound, shape) if gain is None else rng.normal(0.0, math.sqrt(gain) * bound, shape)
+    return nn.Parameter(torch.from_numpy(drawn).to(dtype))
+
+
+def _bias(
+    rng: np.random.Generator, shape: tuple[int, ...], fan_in: int, dtype: torch.dtype, zero: bool
+) -> nn.Parameter:
+    return nn.Parameter(torch.zeros(shape, dtype=dtype)) if zero else _weight(rng, shape, fan_in, dtype, None)
+
+
+def _silence(weight: nn.Parameter, inputs: tuple[int, int], sparsity: float, rng: np.random.Generator) -> None:
+    """Zero ⌈sparsity · fan_in⌉ of every unit's weights, drawn without replacement; ``inputs``: the axes of fan_in."""
+    first, last = inputs
+    shape = weight.shape
+    lead, fan_in = shape[:first], math.prod(shape[first:last])
+    rows = weight.detach().numpy().reshape(*lead, fan_in, *shape[last:])
+    order = rng.random(rows.shape).argsort(axis=first)
+    np.put_along_axis(rows, order.take(range(math.ceil(sparsity * fan_in)), axis=first), 0, axis=first)
 
 
 class GroupedLinear(nn.Module):
     """``copies`` dense layers side by side: ``[copies, B, in] -> [copies, B, out]`` in one batched product."""
 
-    def __init__(self, copies: int, fan_in: int, fan_out: int, rng: np.random.Generator, dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        copies: int,
+        fan_in: int,
+        fan_out: int,
+        rng: np.random.Generator,
+        dtype: torch.dtype,
+        sparsity: float = 0.0,
+        gain: float | None = None,
+    ) -> None:
         super().__init__()
-        self.weight = _uniform(rng, (copies, fan_in, fan_out), fan_in, dtype)
-        self.bias = _uniform(rng, (copies, fan_out), fan_in, dtype)
+        self.weight = _weight(rng, (copies, fan_in, fan_out), fan_in, dtype, gain)
+        if sparsity > 0:
+            _silence(self.weight, (1, 2), sparsity, rng)
+        self.bias = _bias(rng, (copies, fan_out), fan_in, dtype, sparsity > 0 or gain is not None)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply copy c to ``x[c]``."""
@@ -50,17 +102,22 @@ class GroupedLayerNorm(nn.Module):
         copies: number of independent networks.
         shape: normalised shape of one copy.
         dtype: of scale and shift.
+        affine: whether there are a scale and a shift to learn.
     """
 
-    def __init__(self, copies: int, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    weight: nn.Parameter | None
+    bias: nn.Parameter | None
+
+    def __init__(self, copies: int, shape: tuple[int, ...], dtype: torch.dtype, affine: bool = True) -> None:
         super().__init__()
         self.shape = shape
-        self.weight = nn.Parameter(torch.ones(copies, *shape, dtype=dtype))
-        self.bias = nn.Parameter(torch.zeros(copies, *shape, dtype=dtype))
+        self.weight = nn.Parameter(torch.ones(copies, *shape, dtype=dtype)) if affine else None
+        self.bias = nn.Parameter(torch.zeros(copies, *shape, dtype=dtype)) if affine else None
 
     def forward(self, x: Tensor) -> Tensor:
         """``[copies, B, *shape] -> [copies, B, *shape]``."""
-        return nn.functional.layer_norm(x, self.shape) * self.weight[:, None] + self.bias[:, None]
+        hat = nn.functional.layer_norm(x, self.shape)
+        return hat if self.weight is None or self.bias is None else hat * self.weight[:, None] + self.bias[:, None]
 
 
 class Trunk(nn.Module):
@@ -74,6 +131,9 @@ class Trunk(nn.Module):
         activation: str,
         rng: np.random.Generator,
         dtype: torch.dtype,
+        affine: bool = True,
+        sparsity: float = 0.0,
+        init: str = "uniform",
     ) -> None:
         super().__init__()
         self.copies = copies
@@ -83,9 +143,10 @@ class Trunk(nn.Module):
         layers: list[nn.Module] = []
         norms: list[nn.Module] = []
         for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            layers.append(GroupedLinear(copies, fan_in, fan_out, rng, dtype))
+            gain = None if init == "uniform" else _HE if i < len(sizes) - 2 else _LAST
+            layers.append(GroupedLinear(copies, fan_in, fan_out, rng, dtype, sparsity, gain))
             if layer_norm and i < len(sizes) - 2:
-                norms.append(GroupedLayerNorm(copies, (fan_out,), dtype))
+                norms.append(GroupedLayerNorm(copies, (fan_out,), dtype, affine))
         self.layers = nn.ModuleList(layers)
         self.norms = nn.ModuleList(norms)
 
@@ -100,7 +161,10 @@ class Trunk(nn.Module):
 
 
 class GroupedConv(nn.Module):
-    """``copies`` stacks of valid convolutions side by side, grouped: ``[B, C, H, W] -> [copies, B, d]``."""
+    """``copies`` stacks of valid convolutions side by side, grouped: ``[B, *frame] -> [copies, B, d]``.
+
+    The frame's axes are ``[C, H, W]``, ``[H, W, C]`` or ``[H, W]``; ``in_shape`` is what the first convolution takes.
+    """
 
     def __init__(
         self, copies: int, in_shape: tuple[int, ...], body: Conv, rng: np.random.Generator, dtype: torch.dtype
@@ -109,7 +173,12 @@ class GroupedConv(nn.Module):
         self.copies = copies
         self.strides = body.strides
         self.activation = body.activation
-        channels, height, width = in_shape
+        self.in_shape = channels_first(in_shape, body.channel_order)
+        self.frame_shape = tuple(in_shape)
+        # By the order given, not by the shape alone: all three sides may be equal.
+        self.channels_last = body.channel_order == "last" or self.in_shape != self.frame_shape
+        channels, height, width = self.in_shape
+        gain = None if body.init == "uniform" else _HE
         weights: list[nn.Parameter] = []
         biases: list[nn.Parameter] = []
         norms: list[nn.Module] = []
@@ -118,19 +187,27 @@ class GroupedConv(nn.Module):
             if height < 1 or width < 1:
                 raise ValueError(f"a kernel of {kernel} does not fit an observation of {in_shape}; use smaller kernels")
             fan_in = channels * kernel * kernel
-            weights.append(_uniform(rng, (copies * fan_out, channels, kernel, kernel), fan_in, dtype))
-            biases.append(_uniform(rng, (copies * fan_out,), fan_in, dtype))
+            weights.append(_weight(rng, (copies * fan_out, channels, kernel, kernel), fan_in, dtype, gain))
+            if body.sparsity > 0:
+                _silence(weights[-1], (1, 4), body.sparsity, rng)
+            biases.append(_bias(rng, (copies * fan_out,), fan_in, dtype, body.sparsity > 0 or gain is not None))
             if body.layer_norm:
-                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype))
+                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine))
             channels = fan_out
         self.weights = nn.ParameterList(weights)
         self.biases = nn.ParameterList(biases)
         self.norms = nn.ModuleList(norms)
         self.num_features = channels * height * width
 
+    def first(self, s: Tensor) -> Tensor:
+        """Frames as the first convolution takes them, not copied: ``[B, *frame] -> [B, C, H, W]``."""
+        if len(self.frame_shape) == 2:
+            return s[:, None]
+        return s.permute(0, 3, 1, 2) if self.channels_last else s
+
     def forward(self, s: Tensor) -> Tensor:
         """Convolve every copy's own stack over the same images."""
-        x = s
+        x = self.first(s)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             # The first layer's copies all see the same image, so there a plain convolution is the grouped one.
             groups = 1 if i == 0 else self.copies
@@ -143,6 +220,13 @@ class GroupedConv(nn.Module):
         return x.reshape(x.shape[0], self.copies, self.num_features).transpose(0, 1)
 
 
+def _check_start(affine: bool, layer_norm: bool, sparsity: float) -> None:
+    if not affine and not layer_norm:
+        raise ValueError("affine=False says how layers are normalised, and layer_norm is False; leave affine out")
+    if not 0 <= sparsity < 1:
+        raise ValueError(f"sparsity must lie in [0, 1), got {sparsity}; 0.9 is usual for streaming learners")
+
+
 @dataclass(frozen=True)
 class MLP:
     """Dense layers on the flattened observation.
@@ -151,15 +235,23 @@ class MLP:
         hidden: widths of the hidden layers; empty for a linear function with a bias.
         layer_norm: layer normalisation before each activation, as in PQN (Gallici et al., 2024).
         activation: "relu", "tanh" or "leaky_relu" (slope 0.01).
+        affine: whether layer normalisation learns a scale and a shift.
+        sparsity: fraction of every unit's weights that start at zero, below 1.
+        init: how the other weights start, "uniform" or "he".
     """
 
     hidden: tuple[int, ...] = (128, 128)
     layer_norm: bool = False
     activation: str = "relu"
+    affine: bool = True
+    sparsity: float = 0.0
+    init: str = "uniform"
 
     def __post_init__(self) -> None:
-        """Refuse widths below 1 and activations that do not exist."""
+        """Refuse widths below 1, activations that do not exist and layers without a weight."""
         check_choice("activation", self.activation, ACTIVATIONS)
+        check_choice("init", self.init, _INITS)
+        _check_start(self.affine, self.layer_norm, self.sparsity)
         for width in self.hidden:
             check_whole("hidden width", width)
 
@@ -171,12 +263,22 @@ class MLP:
 
     def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
-        return Trunk(copies, (fan_in, *self.hidden, fan_out), self.layer_norm, self.activation, rng, dtype)
+        return Trunk(
+            copies,
+            (fan_in, *self.hidden, fan_out),
+            self.layer_norm,
+            self.activation,
+            rng,
+            dtype,
+            self.affine,
+            self.sparsity,
+            self.init,
+        )
 
 
 @dataclass(frozen=True)
 class Conv:
-    """Valid convolutions on ``[C, H, W]`` observations, then dense layers. The defaults are PQN's net for MinAtar.
+    """Valid convolutions on frames, then dense layers. The defaults have the sizes of PQN's net for MinAtar.
 
     Args:
         channels: output channels of each convolution.
@@ -185,6 +287,11 @@ class Conv:
         hidden: widths of the dense layers after them.
         layer_norm: layer normalisation before each activation.
         activation: as for `MLP`.
+        affine: as for `MLP`.
+        sparsity: as for `MLP`.
+        init: as for `MLP`.
+        channel_order: whether frames are ``[C, H, W]`` ("first") or ``[H, W, C]`` ("last"); "auto" takes the smaller of
+            the two end axes for the channels.
     """
 
     channels: tuple[int, ...] = (16,)
@@ -193,10 +300,17 @@ class Conv:
     hidden: tuple[int, ...] = (128,)
     layer_norm: bool = True
     activation: str = "relu"
+    affine: bool = True
+    sparsity: float = 0.0
+    init: str = "uniform"
+    channel_order: str = "auto"
 
     def __post_init__(self) -> None:
         """Refuse lists of unequal length and values that make no network."""
         check_choice("activation", self.activation, ACTIVATIONS)
+        check_choice("init", self.init, _INITS)
+        check_choice("channel_order", self.channel_order, ("auto", "first", "last"))
+        _check_start(self.affine, self.layer_norm, self.sparsity)
         if not len(self.channels) == len(self.kernel_sizes) == len(self.strides) >= 1:
             raise ValueError(
                 "channels, kernel_sizes and strides need one entry per convolution, got "
@@ -209,11 +323,52 @@ class Conv:
         self, in_shape: tuple[int, ...], copies: int, rng: np.random.Generator, dtype: torch.dtype
     ) -> tuple[nn.Module | None, int]:
         """The convolutions of ``copies`` networks, and the length of the vector each gives."""
-        if len(in_shape) != 3:
-            raise ValueError(f"a Conv body needs observations [channels, height, width], got shape {in_shape}")
         stem = GroupedConv(copies, in_shape, self, rng, dtype)
         return stem, stem.num_features
 
     def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
-        return Trunk(copies, (fan_in, *self.hidden, fan_out), self.layer_norm, self.activation, rng, dtype)
+        return Trunk(
+            copies,
+            (fan_in, *self.hidden, fan_out),
+            self.layer_norm,
+            self.activation,
+            rng,
+            dtype,
+            self.affine,
+            self.sparsity,
+            self.init,
+        )
+
+
+NAMED_BODIES: dict[str, MLP | Conv] = {
+    "mlp": MLP(),
+    # PQN (Gallici et al., 2024) for MinAtar, whose frames are [10, 10, C]; Seaquest's ten channels look like a side.
+    "minatar": Conv(init="he", channel_order="last"),
+    # The network of Mnih et al. (2015) for 84 × 84 frames, with PQN's layer normalisation.
+    "conv": Conv((32, 64, 64), (8, 4, 3), (4, 2, 1), (512,), init="he"),
+}
+"""Bodies by the names that configurations and the command line know them by."""
+
+
+def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
+    """The body for observations where none is asked for.
+
+    Frames of at least 36 a side get the "conv" body, smaller ones "minatar", with the channel order found out; what is
+    too small for a kernel, or no frame at all, gets an `MLP`.
+
+    Args:
+        shape: of one observation.
+        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes.
+
+    Example:
+        >>> body_for((84, 84, 4), True).kernel_sizes, body_for((10, 10), True).kernel_sizes
+        ((8, 4, 3), (3,))
+        >>> body_for((4,), False).hidden
+        (128, 128)
+    """
+    if len(shape) == 3 or (len(shape) == 2 and is_frame):
+        sides = channels_first(shape)[1:]
+        if min(sides) >= 3:
+            return replace(NAMED_BODIES["conv" if min(sides) >= 36 else "minatar"], channel_order="auto")  # type: ignore[arg-type]
+    return MLP()
