@@ -21,9 +21,11 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from neuralq import checkpoint
+from neuralq.best import keep_best
 from neuralq.evaluation import Evaluation, evaluate_greedy
 from neuralq.feed import Feed, Sample
 from neuralq.interact import Interaction, Policy
+from neuralq.learners.average import played_parameters, playing
 from neuralq.learners.update import Learner, Update
 from neuralq.record import RunFolder
 from neuralq.snapshot import Resumability, encode_env, restore_env
@@ -83,8 +85,9 @@ class Session:
     resumability: Resumability
 
     def evaluate(self, num_episodes: int, seed: int, max_steps: int) -> Evaluation:
-        """Greedy evaluation of the present parameters."""
-        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, max_steps)
+        """Greedy evaluation of the parameters that the learner plays with."""
+        with playing(self.learner):
+            return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, max_steps)
 
     def close(self) -> None:
         """Close the environments."""
@@ -327,7 +330,10 @@ class _Loop:
         seed = seed_for(plan.seed, 9, progress.env_steps)
         result = session.evaluate(plan.evaluation_episodes, seed, plan.evaluation_max_steps)
         progress.greedy_return = result.mean
-        progress.best_return = max(result.mean, -np.inf if progress.best_return is None else progress.best_return)
+        if progress.best_return is None or result.mean > progress.best_return:
+            progress.best_return = result.mean
+            seen = None if session.stream.normalisation is None else session.stream.normalisation.state_dict()
+            keep_best(self.folder.path, progress.env_steps, result.mean, played_parameters(session.learner), seen)
         if plan.stop_at_return is not None and progress.reached_at is None and result.mean >= plan.stop_at_return:
             progress.reached_at = progress.env_steps
         self._stop_clock(training=False)
@@ -387,6 +393,7 @@ def restore(session: Session, state: Mapping[str, Any], seed: int) -> Progress:
         restore_env(environments, state["environments"])
         session.stream.load_state_dict(state["stream"])
     else:
+        session.stream.load_normalisation(state["stream"])
         session.stream.restart(seed_for(seed, 8, progress.env_steps))
         session.stream.num_steps = progress.env_steps
         session.learner.begin_streams()

@@ -57,7 +57,7 @@ def test_a_configuration_comes_back_from_json_as_it_was(config: RunConfig) -> No
         ({"body": "MLP"}, "body must be a mapping with a class"),
         ({"body": {"class": "MLP", "layer_norm": "yes"}}, "body.layer_norm must be true or false, got 'yes'"),
         ({"learner": "replay", "rollout": {}}, "settings for the rollout learner would be ignored"),
-        ({"layout": "linear", "body": {"class": "MLP"}}, "a linear has no network body"),
+        ({"layout": "linear", "body": {"class": "MLP"}}, "a linear function has no network body"),
         ({"layout": "table", "engine": "compiled"}, "kernels for MLP networks only"),
     ],
 )

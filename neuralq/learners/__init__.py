@@ -2,27 +2,32 @@
 
 Each has ``update(transition, weight) -> Update``, ``state_dict()`` and ``load_state_dict()``, and decides, alone in the
 library, what is held fixed when a gradient is taken. `RolloutLearner` uses the forward view of TD(λ) over rollouts,
-`ReplayLearner` stored transitions or blocks of them, `OnlineLearner` and `PredictionLearner` the backward view with
-eligibility traces, one step at a time.
+`ReplayLearner` stored transitions or blocks of them, `DistributionalLearner` as well, for the whole distribution of the
+return; `OnlineLearner` and `PredictionLearner` the backward view with eligibility traces, one step at a time;
+`StreamingLearner` as well, with a step that is bounded by what it would do.
 
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 """
 
-from neuralq.learners.batch import ReplayLearner, ReplaySettings
+from neuralq.learners.batch import ReplayLearner
 from neuralq.learners.correction import HeadCorrection, TangentCorrection
+from neuralq.learners.distributional import DistributionalLearner
 from neuralq.learners.dqrc import DQRCLearner, DQRCSettings, TwinHead
 from neuralq.learners.gradient_step import GradientTDSettings
 from neuralq.learners.gradient_td import GradientPredictionLearner, GradientQLearner
 from neuralq.learners.online import OnlineLearner, OnlineSettings, PredictionLearner
+from neuralq.learners.replay_settings import ReplaySettings
 from neuralq.learners.residual_gradient import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
+from neuralq.learners.streaming import StreamingLearner, StreamingSettings
 from neuralq.learners.update import Descent, Learner, Update
 
 __all__ = [
     "DQRCLearner",
     "DQRCSettings",
     "Descent",
+    "DistributionalLearner",
     "GradientPredictionLearner",
     "GradientQLearner",
     "GradientTDSettings",
@@ -37,6 +42,8 @@ __all__ = [
     "ResidualGradientSettings",
     "RolloutLearner",
     "RolloutSettings",
+    "StreamingLearner",
+    "StreamingSettings",
     "TangentCorrection",
     "TwinHead",
     "Update",

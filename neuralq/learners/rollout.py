@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
+from neuralq.learners.average import IterateAverage
 from neuralq.learners.update import Descent, Update
 from neuralq.optim import Optimiser
 from neuralq.q.engine import Engine
@@ -39,7 +40,15 @@ class RolloutSettings:
         optimiser: "radam", "adam" or "sgd".
         max_grad_norm: bound on the gradient's norm; None for none.
         target_period_updates: rollouts between copies into a target network; None for no target network.
-        anneal: whether the learning rate falls linearly to 0 over the run's steps.
+        anneal: whether the learning rate falls linearly over the run's steps.
+        anneal_env_steps: environment steps over which it falls in place of the run's; only with ``anneal``.
+        anneal_to: share of the learning rate that is left then, in [0, 1]; only with ``anneal``.
+        normalise_observations: whether observations are centred and divided by their standard deviation so far
+            (`neuralq.interact.Normalisation`), as quantities of very different size need.
+        refresh_targets: whether the λ-returns are computed anew, with the values of the moment, before every pass; else
+            once per rollout, as published.
+        average_updates: rollouts over which the parameters are averaged that greedy evaluations and the saved agent use
+            (`IterateAverage`, a window of that many rollouts' gradient steps); None to use those that are learned.
     """
 
     lambda_: float = 0.65
@@ -53,6 +62,11 @@ class RolloutSettings:
     max_grad_norm: float | None = 10.0
     target_period_updates: int | None = None
     anneal: bool = False
+    anneal_env_steps: int | None = None
+    anneal_to: float = 0.0
+    normalise_observations: bool = False
+    refresh_targets: bool = False
+    average_updates: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse values outside their range and minibatches that would be empty."""
@@ -64,6 +78,18 @@ class RolloutSettings:
         Optimiser(self.optimiser)
         if self.target_period_updates is not None:
             check_whole("target_period_updates", self.target_period_updates)
+        check_fraction("anneal_to", self.anneal_to)
+        if self.anneal_env_steps is not None:
+            check_whole("anneal_env_steps", self.anneal_env_steps)
+        if not self.anneal and (self.anneal_env_steps is not None or self.anneal_to > 0):
+            raise ValueError("anneal_env_steps and anneal_to would be ignored with anneal=False; set anneal=True")
+        if self.average_updates is not None:
+            check_positive("average_updates", self.average_updates)
+            if self.average_updates * self.num_epochs * self.num_minibatches < 1:
+                raise ValueError(
+                    f"average_updates={self.average_updates!r} is less than one of the "
+                    f"{self.num_epochs * self.num_minibatches} gradient steps of a rollout; leave it out"
+                )
         if self.num_minibatches > self.num_envs * self.num_steps:
             rows = self.num_envs * self.num_steps
             raise ValueError(f"num_minibatches={self.num_minibatches} exceeds the {rows} samples of a rollout")
@@ -77,7 +103,7 @@ class RolloutLearner:
         settings: how to learn.
         rng: draws the minibatches.
         reward_scale: rewards are multiplied by it, so values are too.
-        total_updates: rollouts over which the learning rate falls to 0; None for a constant one.
+        total_updates: rollouts over which the learning rate falls; None for a constant one.
 
     Example:
         >>> from neuralq.q import TableQ
@@ -107,6 +133,10 @@ class RolloutLearner:
         self.num_updates = 0
         self.total_updates = total_updates
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._average: IterateAverage | None = None
+        if settings.average_updates is not None:
+            window = settings.average_updates * settings.num_epochs * settings.num_minibatches
+            self._average = IterateAverage(engine.flat.values, window)
         if settings.target_period_updates is not None:
             engine.sync_target()
 
@@ -129,8 +159,12 @@ class RolloutLearner:
         rows = None if weight is None else weight.reshape(-1).nonzero()[:, 0].cpu().numpy()
         num_rows = len(targets) if rows is None else len(rows)
         errors = picked = targets
-        annealed = 1.0 if self.total_updates is None else max(0.0, 1.0 - self.num_updates / self.total_updates)
-        for _ in range(self.settings.num_epochs):
+        annealed = 1.0
+        if self.total_updates is not None:
+            annealed = max(self.settings.anneal_to, 1.0 - self.num_updates / self.total_updates)
+        for epoch in range(self.settings.num_epochs):
+            if epoch > 0 and self.settings.refresh_targets:
+                targets = self.targets(transition).reshape(-1)
             order = self.rng.permutation(num_rows)
             order = order if rows is None else rows[order]
             for part in np.array_split(order, self.settings.num_minibatches):
@@ -139,20 +173,29 @@ class RolloutLearner:
                 index = torch.from_numpy(part).to(targets.device)
                 picked = targets[index]
                 errors = self._descent.step(s[index], a[index], picked, None, annealed)
+                if self._average is not None:
+                    self._average.follow()
         self.num_updates += 1
         period = self.settings.target_period_updates
         if period is not None and self.num_updates % period == 0:
             self.engine.sync_target()
         return Update(errors, picked)
 
+    def played(self) -> Tensor:
+        """The parameters for greedy play: the average where one is kept, else those that are learned."""
+        return self.engine.flat.values if self._average is None else self._average.values
+
     def begin_streams(self) -> None:
         """Nothing connects one sample to the next."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Parameters, optimiser, target copy and counters."""
-        return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
+        """Parameters, optimiser, target copy, average and counters."""
+        average = None if self._average is None else self._average.state_dict()
+        return {"num_updates": self.num_updates, "descent": self._descent.state_dict(), "average": average}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
         self.num_updates = int(state["num_updates"])
         self._descent.load_state_dict(state["descent"])
+        if self._average is not None:
+            self._average.load_state_dict(state["average"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 from typing import Any
 
@@ -12,22 +13,25 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from neuralq.acting import choose_epsilon_greedy, epsilon_greedy_policy
-from neuralq.features import OneHot, Pixels
+from neuralq.features import OneHot, Pixels, encoder_for
 from neuralq.feed import Feed, OnlineFeed, ReplayFeed, RolloutFeed
-from neuralq.interact import Interaction, ObservationSpec, make_vector_env
+from neuralq.interact import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.learners import (
     Learner,
     OnlineLearner,
     OnlineSettings,
-    ReplayLearner,
     ReplaySettings,
     RolloutLearner,
     RolloutSettings,
+    StreamingLearner,
+    StreamingSettings,
 )
 from neuralq.optim import FlatOptimiser, Optimiser, clip_norm_
-from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
+from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
 from neuralq.q.engine import Engine, Loss, make_engine
 from neuralq.recipes.config import RunConfig
+from neuralq.recipes.games import ATARI, make_single, register_games
+from neuralq.recipes.replay import as_distribution, num_atoms, replay_learner
 from neuralq.replay import Prioritised, ReplayBuffer
 from neuralq.rules import Linear
 from neuralq.snapshot import is_resumable
@@ -35,7 +39,7 @@ from neuralq.training import Plan, Session, seed_for
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
-__all__ = ["build_q", "build_session", "make_envs", "plan_of"]
+__all__ = ["build_q", "build_session", "make_envs", "normalisation_for", "plan_of"]
 
 _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]] = {
     "action-input": ActionInputQ,
@@ -54,6 +58,7 @@ def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
         ValueError: if the environment is not registered or cannot be made, with what to do about it.
     """
     module, _, env_id = config.env.rpartition(":")
+    register_games(env_id)
     try:
         if module:  # registers the environment
             importlib.import_module(module)
@@ -61,9 +66,9 @@ def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
         twin = vector_twin(spec, config.env_kwargs)
         if twin is not None:
             return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
-        if num_envs > 1 and spec.vector_entry_point is not None:
+        if num_envs > 1 and spec.vector_entry_point is not None and not env_id.startswith(ATARI):
             return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
-        return make_vector_env(lambda: gym.make(env_id, **config.env_kwargs), num_envs)
+        return make_vector_env(lambda: make_single(env_id, config.env_kwargs), num_envs)
     except gym.error.Error as error:
         raise ValueError(
             f"cannot make the environment {config.env!r}: {str(error).rstrip('.')}. Name a registered Gymnasium id; an "
@@ -87,10 +92,11 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     q: QFunction
     shape, num_categories = spec.inner_shape, spec.num_categories
     features: nn.Module | None = None
+    num_outputs = spec.num_actions * num_atoms(config)
     if config.layout == "table":
         if num_categories is None:
             raise ValueError("a table needs finitely many states; choose another layout")
-        q = TableQ(num_categories, spec.num_actions)
+        q = as_distribution(config, TableQ(num_categories, num_outputs))
         return MaskedQ(q, shape) if spec.masked else q
     if num_categories is not None:
         features, shape = OneHot(num_categories), (num_categories,)
@@ -101,11 +107,38 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
         if len(shape) > 1:
             flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape)))
         # One-hot features already span the constant; a bias would make the weights redundant.
-        q = LinearQ(int(np.prod(shape)), spec.num_actions, bias=num_categories is None, features=flat)
+        q = LinearQ(int(np.prod(shape)), num_outputs, bias=num_categories is None, features=flat)
     else:
-        body = config.body or (Conv() if len(shape) == 3 else MLP())
-        q = _NETWORKS[config.layout](shape, spec.num_actions, body, features, rng)
+        body = config.body or body_for(shape, is_frame=spec.dtype.kind in "bu")
+        if config.dueling:
+            q = DuelingQ(shape, spec.num_actions, body, features, rng, num_atoms=num_atoms(config))
+        else:
+            q = _NETWORKS[config.layout](shape, num_outputs, body, features, rng)
+    q = as_distribution(config, q)
     return MaskedQ(q, spec.inner_shape) if spec.masked else q
+
+
+def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Normalisation | None:
+    """The statistics through which the configured learner sees a stream; None for those that see it as it is.
+
+    Raises:
+        ValueError: where state indices would have to be normalised.
+    """
+    settings = config.settings
+    if not isinstance(settings, StreamingSettings | RolloutSettings):
+        return None
+    if isinstance(settings, RolloutSettings) and not settings.normalise_observations:
+        return None
+    encoder = encoder_for(envs.single_observation_space, as_index=config.layout == "table")
+    is_index = encoder.num_categories is not None
+    if is_index and settings.normalise_observations:
+        raise ValueError("state indices have no mean to subtract; leave normalise_observations out")
+    observations = not is_index if settings.normalise_observations is None else settings.normalise_observations
+    rewards = isinstance(settings, StreamingSettings) and settings.scale_rewards
+    if not observations and not rewards:
+        return None
+    num_lanes = getattr(settings, "num_envs", 1)  # as in training, also where one environment is made to play
+    return Normalisation(encoder.shape, config.gamma, num_lanes, observations, rewards)
 
 
 def build_session(config: RunConfig) -> Session:
@@ -119,23 +152,28 @@ def build_session(config: RunConfig) -> Session:
     num_envs = getattr(settings, "num_envs", 1)
     envs = make_envs(config, num_envs)
     as_index = config.layout == "table"
-    stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index)
+    normalisation = normalisation_for(config, envs)
+    stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
     q = build_q(config, stream.spec, np.random.default_rng(seed_for(config.seed, 3)))
     if isinstance(q, nn.Module):
         q.to(config.device)
-    loss = Loss(settings.loss) if isinstance(settings, ReplaySettings) else Loss("squared")
+    loss = Loss("huber" if isinstance(settings, ReplaySettings) and settings.loss == "huber" else "squared")
     engine = make_engine(q, loss, config.engine)
     learner = _learner(config, engine, generators["samples"])
     feed = _feed(config, stream.spec, num_envs, generators["samples"])
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
-    policy = epsilon_greedy_policy(engine.all, lambda: epsilon.value(stream.num_steps), generators["policy"])
+    values = learner.values if isinstance(learner, StreamingLearner) else engine.all
+    policy = epsilon_greedy_policy(values, lambda: epsilon.value(stream.num_steps), generators["policy"])
     evaluation_envs = make_envs(config, config.evaluation_episodes)
-    evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index)
+    frozen = None if normalisation is None else normalisation.frozen()
+    evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index, frozen)
     probe = is_resumable(
         lambda: make_envs(config, num_envs), seed_for(config.seed, 5), np.random.default_rng(seed_for(config.seed, 6))
     )
     _warm(engine, stream, settings)
+    if isinstance(settings, StreamingSettings):
+        _warm_streaming(config, engine, stream)
     return Session(stream, policy, feed, learner, generators, evaluation, probe)
 
 
@@ -153,18 +191,24 @@ def _learner(config: RunConfig, engine: Engine, rng: np.random.Generator) -> Lea
     settings = config.settings
     if isinstance(settings, RolloutSettings):
         rows = settings.num_envs * settings.num_steps
-        total = -(-config.total_steps // rows) if settings.anneal else None
+        total = -(-(settings.anneal_env_steps or config.total_steps) // rows) if settings.anneal else None
         return RolloutLearner(engine, settings, rng, config.reward_scale, total)
     if isinstance(settings, ReplaySettings):
-        return ReplayLearner(engine, settings, config.reward_scale)
+        return replay_learner(config, engine)
+    if isinstance(settings, StreamingSettings):
+        return StreamingLearner(engine, settings, config.gamma, config.reward_scale, _kernels(config))
     return OnlineLearner(engine, settings, 1, config.reward_scale)
+
+
+def _kernels(config: RunConfig) -> str:
+    return "auto" if config.engine == "compiled" else config.engine
 
 
 def _feed(config: RunConfig, spec: ObservationSpec, num_envs: int, rng: np.random.Generator) -> Feed:
     settings = config.settings
     if isinstance(settings, RolloutSettings):
         return RolloutFeed(settings.num_steps, num_envs, spec)
-    if isinstance(settings, OnlineSettings):
+    if isinstance(settings, OnlineSettings | StreamingSettings):
         return OnlineFeed(num_envs, spec)
     buffer = _buffer(settings, spec, settings.capacity)
     return ReplayFeed(
@@ -185,7 +229,7 @@ def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
     s = torch.from_numpy(stream.state_dict()["s"])
     q = engine.all(s)
     a, _ = choose_epsilon_greedy(q, 0.5, np.full(len(s), 0.5))
-    if isinstance(settings, OnlineSettings):
+    if isinstance(settings, OnlineSettings | StreamingSettings):
         return
     engine.loss_gradient(s, a.to(q.device), torch.zeros(len(s), dtype=q.dtype, device=q.device))
     engine.flat.grad.zero_()
@@ -195,6 +239,19 @@ def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
     clip_norm_(throwaway, 0.5)
     if isinstance(settings, ReplaySettings):
         _warm_buffer(_buffer(settings, stream.spec, 8 * settings.num_envs), stream, settings)
+
+
+def _warm_streaming(config: RunConfig, engine: Engine, stream: Interaction) -> None:
+    """A step of a learner that is thrown away."""
+    s = torch.from_numpy(stream.state_dict()["s"]).to(config.device)
+    a, one = torch.zeros(1, dtype=torch.int64, device=config.device), torch.ones(1, device=config.device)
+    twin = make_engine(copy.deepcopy(engine.q), Loss("squared"), config.engine)
+    learner = StreamingLearner(twin, config.settings, config.gamma, 1.0, _kernels(config))  # type: ignore[arg-type]
+    learner.values(s)
+    learner.update(Transition(s, a, one, one, one, s, one > 0))
+    if stream.normalisation is not None:
+        same = Normalisation((2,), 0.5, 1)
+        same.reward(np.ones(1), np.zeros(1, bool), np.ones(1, bool))
 
 
 def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: ReplaySettings) -> None:

@@ -10,16 +10,17 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
-from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
-from neuralq.q import MLP, Conv
+from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+from neuralq.q import MLP, NAMED_BODIES, Conv
 
-__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "config_from_dict", "config_to_dict"]
+__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict"]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
-LEARNERS: dict[str, type[RolloutSettings] | type[ReplaySettings] | type[OnlineSettings]] = {
+LEARNERS: dict[str, type[RolloutSettings] | type[ReplaySettings] | type[OnlineSettings] | type[StreamingSettings]] = {
     "rollout": RolloutSettings,
     "replay": ReplaySettings,
     "online": OnlineSettings,
+    "streaming": StreamingSettings,
 }
 NETWORKS = ("action-input", "separate", "action-output")
 BODIES: dict[str, type[MLP] | type[Conv]] = {"MLP": MLP, "Conv": Conv}
@@ -33,7 +34,7 @@ class RunConfig:
     Args:
         env: Gymnasium id, or "module:id" to import a module that registers it.
         env_kwargs: passed to `gymnasium.make`.
-        learner: "rollout", "replay" or "online".
+        learner: "rollout", "replay", "online" or "streaming".
         layout: "table", "linear", "action-input", "separate" or "action-output".
         seed: from which every generator is derived.
         total_steps: environment steps, summed over parallel environments.
@@ -44,9 +45,11 @@ class RunConfig:
         epsilon_end: exploration after ``epsilon_decay_steps``, reached linearly.
         epsilon_decay_steps: environment steps.
         body: network body, MLP or Conv; networks only. None picks MLP, or Conv for images.
+        dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
         rollout: settings of the rollout learner; only with ``learner="rollout"``.
         replay: settings of the replay learner; only with ``learner="replay"``.
         online: settings of the online learner; only with ``learner="online"``.
+        streaming: settings of the streaming learner; only with ``learner="streaming"``.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
         evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
@@ -70,9 +73,11 @@ class RunConfig:
     epsilon_end: float = 0.05
     epsilon_decay_steps: int = 20_000
     body: MLP | Conv | None = None
+    dueling: bool = False
     rollout: RolloutSettings | None = None
     replay: ReplaySettings | None = None
     online: OnlineSettings | None = None
+    streaming: StreamingSettings | None = None
     evaluate_every: int = 4096
     evaluation_episodes: int = 20
     evaluation_max_steps: int = 10_000
@@ -104,9 +109,9 @@ class RunConfig:
             "checkpoint_every",
             "log_every",
             "threads",
+            "epsilon_decay_steps",
         ):
             check_whole(name, getattr(self, name))
-        check_whole("epsilon_decay_steps", self.epsilon_decay_steps)
         for name, settings in LEARNERS.items():
             given = getattr(self, name)
             if name == self.learner and given is None:
@@ -117,17 +122,52 @@ class RunConfig:
                     f"use learner={name!r} or leave them out"
                 )
         if self.body is not None and self.layout not in NETWORKS:
-            raise ValueError(
-                f"a {self.layout} has no network body; leave body out or choose one of {', '.join(NETWORKS)}"
-            )
+            what = "table" if self.layout == "table" else "linear function"
+            raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
         if self.engine == "compiled" and (self.layout not in NETWORKS or isinstance(self.body, Conv)):
             raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+        _check_outputs(self)
 
     @property
-    def settings(self) -> RolloutSettings | ReplaySettings | OnlineSettings:
+    def settings(self) -> RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings:
         """The settings of the learner that runs."""
-        chosen: RolloutSettings | ReplaySettings | OnlineSettings = getattr(self, self.learner)
+        chosen: RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings = getattr(self, self.learner)
         return chosen
+
+
+def _check_outputs(config: RunConfig) -> None:
+    """Dueling streams and distributions are made of several outputs, which not every layout has."""
+    distribution = "none" if config.replay is None else config.replay.distribution
+    if config.dueling and config.layout != "action-output":
+        why = {
+            "action-input": "an action-input network sees one action at a time and has no average over them",
+            "separate": "separate networks share nothing that a common value could be learned from",
+        }.get(config.layout, f"in a {config.layout} function a value stream adds nothing to the action values")
+        raise ValueError(f"dueling needs layout='action-output', got {config.layout!r}: {why}")
+    if config.dueling and config.body is not None and not config.body.hidden:
+        raise ValueError("dueling streams need a hidden layer, got a body with hidden=(); give it a width")
+    if distribution != "none" and config.layout in ("action-input", "separate"):
+        raise ValueError(
+            f"distribution={distribution!r} needs several outputs per action, and {config.layout} networks have one "
+            "output each; use layout='action-output', 'linear' or 'table'"
+        )
+    if config.dueling and config.replay is not None and config.replay.target_rule == "dqrc":
+        raise ValueError(
+            "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
+            "leave dueling out"
+        )
+    if config.engine == "compiled" and (config.dueling or distribution != "none"):
+        raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
+
+
+def body_to_dict(body: MLP | Conv) -> dict[str, Any]:
+    """A body as configurations write it: its class and its settings.
+
+    Example:
+        >>> body_to_dict(MLP((8,)))["class"]
+        'MLP'
+    """
+    return {"class": type(body).__name__, **dataclasses.asdict(body)}
 
 
 def config_to_dict(config: RunConfig) -> dict[str, Any]:
@@ -139,7 +179,7 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
     """
     plain = dataclasses.asdict(config)
     if config.body is not None:
-        plain["body"] = {"class": type(config.body).__name__, **plain["body"]}
+        plain["body"] = body_to_dict(config.body)
     return {name: value for name, value in plain.items() if name not in LEARNERS or name == config.learner}
 
 
@@ -159,8 +199,11 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
         if values.get(name) is not None:
             values[name] = settings(**_fitted(name, values[name], settings))
     if values.get("body") is not None:
+        if isinstance(values["body"], str) and values["body"] in NAMED_BODIES:
+            values["body"] = body_to_dict(NAMED_BODIES[values["body"]])
         if not isinstance(values["body"], Mapping):
-            raise ValueError(f"body must be a mapping with a class, got {values['body']!r}")
+            known = ", ".join(NAMED_BODIES)
+            raise ValueError(f"body must be a mapping with a class, or one of {known}, got {values['body']!r}")
         body = dict(values["body"])
         check_choice("class of the body", body.get("class"), BODIES)
         kind = BODIES[body.pop("class")]

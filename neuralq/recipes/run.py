@@ -13,15 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
+from torch import Tensor
 
 from neuralq import checkpoint
 from neuralq.agent import Agent
+from neuralq.best import load_best
 from neuralq.checks import check_whole
 from neuralq.evaluation import Evaluation, evaluate_greedy
 from neuralq.features import discrete_actions
 from neuralq.interact import Interaction
 from neuralq.q.flat import FlatParameters
-from neuralq.recipes.build import build_q, build_session, make_envs, plan_of
+from neuralq.recipes.build import build_q, build_session, make_envs, normalisation_for, plan_of
 from neuralq.recipes.config import RunConfig, config_from_dict, config_to_dict
 from neuralq.record import RunFolder, default_run_path, read_config, refuse_old_run
 from neuralq.training import Hook, Progress, Session, fit, restore, seed_for
@@ -151,44 +153,65 @@ def _conclude(config: RunConfig, session: Session, progress: Progress, folder: R
     return run
 
 
-def load(run_dir: str | Path) -> Agent:
-    """The agent of a run's newest checkpoint.
+def load(run_dir: str | Path, best: bool = False) -> Agent:
+    """The agent of a run's newest checkpoint, or of its best evaluation.
+
+    Args:
+        run_dir: folder of the run.
+        best: the parameters whose greedy evaluation scored highest, in place of the newest.
 
     Raises:
         RunFolderError: if there is no run in the folder.
         CheckpointError: if no checkpoint is intact.
     """
     config = config_from_dict(read_config(run_dir))
-    saved = checkpoint.load_newest(Path(run_dir) / "checkpoints")
+    parameters, statistics = _kept(Path(run_dir), best)
     envs = make_envs(config, 1)
     try:
-        stream = Interaction(envs, config.gamma, 0, config.layout == "table")
+        seen = normalisation_for(config, envs)
+        if seen is not None:
+            seen.load_state_dict(statistics)
+            seen = seen.frozen()
+        stream = Interaction(envs, config.gamma, 0, config.layout == "table", seen)
         q = build_q(config, stream.spec, np.random.default_rng(0))
-        state = saved.state["learner"]
-        parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
-        FlatParameters(q).load(torch.as_tensor(parameters))  # type: ignore[arg-type]
+        FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
-        return Agent(q, stream.encoder, stream.spec, first_action, config.reward_scale)
+        scale = config.reward_scale * (1.0 if seen is None else seen.reward_scale)
+        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen)
     finally:
         envs.close()
 
 
-def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0) -> Evaluation:
-    """Greedy returns of a run's newest checkpoint on fresh episodes.
+def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
+    """The flat parameters, and the statistics through which observations were seen."""
+    if best:
+        kept = load_best(run_dir)
+        return kept.parameters, kept.normalisation
+    saved = checkpoint.load_newest(run_dir / "checkpoints").state
+    state = saved["learner"]
+    parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
+    if state.get("average") is not None:
+        parameters = state["average"]["values"]
+    return torch.as_tensor(parameters), saved["stream"].get("normalisation")
+
+
+def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool = False) -> Evaluation:
+    """Greedy returns of a run's newest checkpoint, or of its best evaluation, on fresh episodes.
 
     Args:
         run_dir: folder of the run.
         num_episodes: how many episodes.
         seed: of the episodes; unrelated to those seen in training.
+        best: play with the parameters whose greedy evaluation scored highest, in place of the newest.
     """
     check_whole("num_episodes", num_episodes)
     check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
-    agent = load(run_dir)
+    agent = load(run_dir, best)
     with _threads(config):
         envs = make_envs(config, min(num_episodes, 64))
         try:
-            stream = Interaction(envs, config.gamma, 0, config.layout == "table")
+            stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
             with torch.no_grad():
                 return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7))
         finally:
