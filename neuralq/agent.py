@@ -9,7 +9,7 @@ import torch
 
 from neuralq.acting import choose_greedy
 from neuralq.features import Encoder
-from neuralq.interact import ObservationSpec
+from neuralq.interact import Normalisation, ObservationSpec
 from neuralq.types import QFunction
 
 __all__ = ["Agent"]
@@ -26,16 +26,24 @@ class Agent:
         spec: shape and kind of the encoded observations.
         first_action: smallest action of the environment (0 unless its space starts elsewhere).
         reward_scale: by which rewards were multiplied for learning; values are given in the environment's units.
+        normalisation: through which observations were seen, frozen.
     """
 
     def __init__(
-        self, q: QFunction, encoder: Encoder, spec: ObservationSpec, first_action: int = 0, reward_scale: float = 1.0
+        self,
+        q: QFunction,
+        encoder: Encoder,
+        spec: ObservationSpec,
+        first_action: int = 0,
+        reward_scale: float = 1.0,
+        normalisation: Normalisation | None = None,
     ) -> None:
         self.q = q
         self.encoder = encoder
         self.spec = spec
         self.first_action = first_action
         self.reward_scale = reward_scale
+        self.normalisation = normalisation
 
     def values(self, observation: Any, action_mask: Any = None) -> _Array:
         """Action values of one observation, in units of the environment's return.
@@ -54,6 +62,8 @@ class Agent:
         if mask.shape != (self.spec.num_actions,):
             raise ValueError(f"action_mask must have {self.spec.num_actions} entries, got shape {mask.shape}")
         encoded = np.asarray(self.encoder.encode_single(observation))[None]
+        if self.normalisation is not None:
+            encoded = self.normalisation.observe(encoded)
         if self.spec.masked:
             flat = np.concatenate([encoded.reshape(1, -1), mask.reshape(1, -1)], axis=1)
             encoded = flat.astype(self.spec.dtype)

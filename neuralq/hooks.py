@@ -1,7 +1,8 @@
-"""Hooks that watch a run: a live progress bar in the terminal, and TensorBoard."""
+"""Hooks that watch a run: a live progress bar in the terminal, TensorBoard, and Weights & Biases."""
 
 from __future__ import annotations
 
+import secrets
 import sys
 import time
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from neuralq.report import MissingExtra
 
-__all__ = ["ProgressBar", "TensorBoard"]
+__all__ = ["ProgressBar", "TensorBoard", "WeightsAndBiases"]
 
 _QUIET_SECONDS = 10.0
 """Where the output is no terminal: one line at most this often."""
@@ -104,3 +105,45 @@ class TensorBoard:
     def close(self) -> None:
         """Flush and close the files."""
         self._writer.close()
+
+
+class WeightsAndBiases:
+    """Logs every number of every row to Weights & Biases; ``WANDB_MODE=offline`` keeps it on this machine.
+
+    A resumed run goes on in the same record, whose id is kept in the run folder.
+
+    Args:
+        run_dir: folder of the run; the package keeps its files in ``wandb/`` there.
+        config: shown as the run's configuration.
+        project: where the run is filed.
+
+    Raises:
+        MissingExtra: if the package is not installed.
+    """
+
+    def __init__(self, run_dir: str | Path, config: Mapping[str, Any], project: str = "neuralq") -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise MissingExtra(
+                'Weights & Biases is not installed; install it with: pip install "neuralq[wandb]"'
+            ) from error
+        folder = Path(run_dir)
+        kept = folder / "wandb" / "neuralq-run-id"
+        if not kept.exists():
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_text(secrets.token_hex(8))
+        self._run: Any = wandb.init(
+            project=project, name=folder.name, id=kept.read_text(), resume="allow", dir=str(folder), config=dict(config)
+        )
+        # Steps are a column of their own: the package drops rows that go back in its own count, as a resumed run does.
+        self._run.define_metric("*", step_metric="env_steps")
+
+    def __call__(self, row: Mapping[str, Any]) -> None:
+        """Log one row."""
+        numbers = {f"{row['kind']}/{k}": v for k, v in row.items() if isinstance(v, int | float) and k != "env_steps"}
+        self._run.log({**numbers, "env_steps": row["env_steps"]})
+
+    def close(self) -> None:
+        """Send what is left and end the record."""
+        self._run.finish()

@@ -226,7 +226,7 @@ def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> N
         ("total_stepz: 5", "unknown key 'total_stepz'; did you mean total_steps?"),
         ("rollout: {num_envz: 5}", "rollout has unknown keys num_envz; known are"),
         ("replay: {capacity: 500}", "settings for the replay learner would be ignored"),
-        ("learner: sarsa", "learner must be one of 'rollout', 'replay', 'online', got 'sarsa'"),
+        ("learner: sarsa", "learner must be one of 'rollout', 'replay', 'online', 'streaming', got 'sarsa'"),
         ("learner: [rollout]", "learner must be text, got ['rollout']"),
         ("total_steps: many", "total_steps must be a whole number, got 'many'"),
         ("total_steps: 2.5", "total_steps must be a whole number, got 2.5"),
@@ -252,6 +252,7 @@ LEARNERS: dict[str, list[str]] = {
     "rollout": ["--rollout.num-envs", "3", "--rollout.num-steps", "8"],
     "replay": ["--replay.learning-starts", "50", "--replay.batch-size", "8", "--replay.capacity", "200"],
     "online": ["--online.lambda", "0.5"],
+    "streaming": ["--streaming.lambda", "0.5"],
 }
 
 
@@ -279,7 +280,7 @@ def test_every_layout_goes_with_every_learner(layout: str, learner: str, tmp_pat
     ("argv", "said"),
     [
         (["--layout", "table", "--hidden", "8"], "a table has no network body"),
-        (["--layout", "linear", "--body", "{class: MLP}"], "a linear has no network body"),
+        (["--layout", "linear", "--body", "{class: MLP}"], "a linear function has no network body"),
         (["--replay.batch-size", "3"], "--replay.batch-size is for the replay learner, and this is a rollout run"),
         (["--learner", "online", "--rollout.num-envs=3"], "add --learner rollout or leave it out"),
         (["--learner", "sarsa"], "--learner"),
@@ -293,7 +294,7 @@ def test_every_layout_goes_with_every_learner(layout: str, learner: str, tmp_pat
         (["--hidden", "8,x"], "--hidden takes whole numbers like 64,64, got '8,x'"),
         (["--activation", "sine"], "activation must be one of"),
         (["--env-kwargs", "{x"], "--env-kwargs must be a mapping, got {x"),
-        (["--body", "3"], "--body must be a mapping, got 3"),
+        (["--body", "3"], "body must be a mapping with a class, or one of mlp, minatar, conv, got '3'"),
         (["--foo", "3"], "unrecognized arguments: --foo 3; `neuralq train --help` lists the options"),
         (["Acrobot-v1"], "one environment at a time, got 'CartPole-v1' and 'Acrobot-v1'"),
         (["--seed"], "--seed"),

@@ -17,9 +17,15 @@ COMMANDS = {
     "resume": ("neuralq.cli.runs", "resume", "go on with a run that was stopped or killed"),
     "evaluate": ("neuralq.cli.runs", "evaluate", "play greedy episodes with a trained run"),
     "report": ("neuralq.cli.runs", "report", "write a run's report.html"),
+    "compare": ("neuralq.cli.compare", "compare", "table and plot of several runs or sweeps side by side"),
+    "presets": ("neuralq.cli.presets", "presets", "list the tuned settings per environment"),
+    "watch": ("neuralq.cli.media", "watch", "watch a trained run play in a window"),
+    "record": ("neuralq.cli.media", "record", "film a trained run as a GIF or MP4"),
+    "export": ("neuralq.cli.export", "export", "write a run's network as ONNX, checked against its values"),
     "solve": ("neuralq.cli.exact", "solve", "compute the exact answer of an environment with a model"),
     "chapter": ("neuralq.cli.chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13"),
     "baird": ("neuralq.cli.demo", "baird", "predict divergence on Baird's star, then measure it"),
+    "lab": ("neuralq.cli.lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page"),
     "demo": ("neuralq.cli.demo", "demo", "learn CartPole, predict a divergence, write a page about both"),
 }
 

@@ -15,20 +15,22 @@ import yaml  # type: ignore[import-untyped]
 from jsonargparse import ArgumentParser
 
 from neuralq.cli import Failure
+from neuralq.q.bodies import NAMED_BODIES
 from neuralq.recipes import RunConfig, preset_for
-from neuralq.recipes.config import LAYOUTS, LEARNERS, NETWORKS, config_from_dict, config_to_dict
+from neuralq.recipes.config import LAYOUTS, LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
 
 __all__ = ["TrainOptions", "hyphenated", "parse_train"]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
+  neuralq train CartPole-v1 --seeds 10
   neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
   neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
   neuralq train my_package:MyEnv-v0 --rollout.lambda 0.8 --hidden 64,64
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
-_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "print_config"}
+_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "wandb", "print_config"}
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "dict": "a mapping"}
 
 
@@ -39,12 +41,18 @@ class TrainOptions:
     Args:
         run_dir: folder for the run, or None for one of its own.
         tensorboard: whether to write event files.
+        wandb: whether to log to Weights & Biases.
+        seeds: how many seeds to run side by side, or None for one run.
+        workers: how many of them at a time, or None for as many as there are cores.
         json: whether to print the result as JSON.
         preset: whether a preset gave defaults.
     """
 
     run_dir: str | None
     tensorboard: bool
+    wandb: bool
+    seeds: int | None
+    workers: int | None
     json: bool
     preset: bool
 
@@ -190,7 +198,8 @@ def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
     add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
     add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
     _add_fields(parser, RunConfig, "", preset)
-    add("--body", type=dict | None, metavar="MAPPING", help="network body, e.g. '{class: MLP, hidden: [64]}'")
+    bodies = f"{', '.join(NAMED_BODIES)}, or a mapping: '{{class: MLP, hidden: [64]}}'"
+    add("--body", type=dict | str | None, metavar="NAME", help=f"network body: {bodies}")
     add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
     add("--layer_norm", type=bool | None, metavar="{true,false}", help="layer normalisation in the network")
     add("--activation", type=str, metavar="NAME", help="relu, tanh or leaky_relu")
@@ -203,7 +212,10 @@ def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
         metavar="{true,false}",
         help="whether to start from the environment's preset (default: true)",
     )
+    add("--seeds", type=int, metavar="N", help="run N seeds, counted from --seed, in processes side by side")
+    add("--workers", type=int, metavar="N", help="how many seeds at a time (default: as many as there are cores)")
     add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
+    add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
     add("--json", action="store_true", help="print the result as one JSON object on the last line")
     group = parser.add_argument_group(f"options of the {learner} learner")
     _add_fields(group, LEARNERS[learner], f"{learner}.", preset.get(learner, {}))
@@ -226,11 +238,16 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         return None
     _refuse_other_learners(rest, known.learner)
     given = _build(known.learner, preset).parse_args(rest, defaults=False).as_dict()
-    run_dir, tensorboard, as_json = (
-        given.pop("run_dir", None),
-        given.pop("tensorboard", False),
-        given.pop("json", False),
+    options = TrainOptions(
+        run_dir=given.pop("run_dir", None),
+        tensorboard=given.pop("tensorboard", False),
+        wandb=given.pop("wandb", False),
+        seeds=given.pop("seeds", None),
+        workers=given.pop("workers", None),
+        json=given.pop("json", False),
+        preset=bool(preset),
     )
+    _check_counts(options)
     printed = given.pop("print_config", False)
     given.pop("preset", None)
     try:
@@ -240,7 +257,16 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     if printed:
         print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
         return None
-    return config, TrainOptions(run_dir, tensorboard, as_json, bool(preset))
+    return config, options
+
+
+def _check_counts(options: TrainOptions) -> None:
+    for name in ("seeds", "workers"):
+        number = getattr(options, name)
+        if number is not None and number < 1:
+            raise Failure(f"--{name} must be a whole number of at least 1, got {number}", 2)
+    if options.workers is not None and options.seeds is None:
+        raise Failure("--workers says how many seeds run at a time; add --seeds or leave it out", 2)
 
 
 def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -258,5 +284,8 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
         except ValueError as error:
             raise Failure(f"--hidden takes whole numbers like 64,64, got {short['hidden']!r}", 2) from error
     if short:
-        values["body"] = {"class": "MLP", **(values.get("body") or {}), **short}
+        body = values.get("body") or {}
+        if isinstance(body, str) and body in NAMED_BODIES:
+            body = body_to_dict(NAMED_BODIES[body])
+        values["body"] = {"class": "MLP", **body, **short} if isinstance(body, dict) else body
     return values

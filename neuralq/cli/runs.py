@@ -10,15 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
+from neuralq.best import load_best
+from neuralq.checkpoint import CheckpointError
 from neuralq.cli import Failure, command_parser, print_result
 from neuralq.cli.options import parse_train
-from neuralq.hooks import ProgressBar, TensorBoard
+from neuralq.cli.sweeps import resume_seeds, single_run, train_seeds
+from neuralq.hooks import ProgressBar, TensorBoard, WeightsAndBiases
 from neuralq.recipes import Run, evaluate_run
 from neuralq.recipes import resume as resume_run
 from neuralq.recipes import train as train_run
-from neuralq.recipes.config import config_from_dict
+from neuralq.recipes.config import config_from_dict, config_to_dict
 from neuralq.record import default_run_path, read_config, refuse_old_run
 from neuralq.report import MissingExtra, write_report
+from neuralq.sweep import is_sweep_folder
 from neuralq.training import Hook
 
 __all__ = ["evaluate", "report", "resume", "train"]
@@ -30,14 +34,18 @@ def train(argv: list[str]) -> int:
     if parsed is None:
         return 0
     config, options = parsed
+    if options.seeds is not None:
+        return train_seeds(config, options)
     path = Path(options.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
     refuse_old_run(path)  # also by train_run, but preparing takes seconds
-    preset = f"; preset for {config.env}" if options.preset else ""
+    preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
     _say(f"run folder {path}{preset}; preparing (the first run on a machine compiles kernels)")
     with contextlib.ExitStack() as stack:
         hooks: list[Hook] = []
         if options.tensorboard:
             hooks.append(stack.enter_context(contextlib.closing(TensorBoard(path / "tensorboard"))))
+        if options.wandb:
+            hooks.append(stack.enter_context(contextlib.closing(WeightsAndBiases(path, config_to_dict(config)))))
         hooks.append(stack.enter_context(ProgressBar(config.total_steps, config.stop_at_return)))
         run = train_run(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return)
@@ -46,32 +54,43 @@ def train(argv: list[str]) -> int:
 def resume(argv: list[str]) -> int:
     """Go on with a run."""
     parser = command_parser(
-        "resume", "Go on with a run from its newest intact checkpoint.", "neuralq resume runs/demo/cartpole"
+        "resume",
+        "Go on with a run from its newest intact checkpoint, or with a sweep of seeds where each of them stands.",
+        "neuralq resume runs/demo/cartpole",
     )
-    parser.add_argument("run", help="run folder")
+    parser.add_argument("run", help="run folder, or sweep folder")
     parser.add_argument("--total-steps", type=int, help="a new budget; lets a finished run go on")
+    parser.add_argument("--workers", type=int, metavar="N", help="of a sweep: how many seeds at a time")
     options = parser.parse_args(argv)
+    if is_sweep_folder(options.run):
+        return resume_seeds(options.run, options.total_steps, options.workers, options.json)
+    if options.workers is not None:
+        raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
     config = config_from_dict(read_config(options.run))
     board = Path(options.run) / "tensorboard"
     with contextlib.ExitStack() as stack:
         hooks: list[Hook] = []
         if board.is_dir():  # the run was started with --tensorboard
             hooks.append(stack.enter_context(contextlib.closing(TensorBoard(board))))
+        if (Path(options.run) / "wandb").is_dir():  # with --wandb
+            tracker = WeightsAndBiases(options.run, config_to_dict(config))
+            hooks.append(stack.enter_context(contextlib.closing(tracker)))
         hooks.append(stack.enter_context(ProgressBar(options.total_steps or config.total_steps, config.stop_at_return)))
         run = resume_run(options.run, options.total_steps, hooks)
     return _conclude(run, options.json, config.stop_at_return)
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play greedy episodes with a run's newest checkpoint."""
+    """Play greedy episodes with a run's newest checkpoint, or its best."""
     parser = command_parser(
         "evaluate", "Play greedy episodes with a trained run.", "neuralq evaluate RUN --episodes 100"
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument("--best", action="store_true", help="play with the best parameters of the run, not the last")
     options = parser.parse_args(argv)
-    result = evaluate_run(options.run, options.episodes, options.seed)
+    result = evaluate_run(single_run(options.run), options.episodes, options.seed, options.best)
     returns = np.array(result.returns)
     error = float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None
     quartiles = np.percentile(returns, [0, 25, 50, 75, 100])
@@ -82,6 +101,7 @@ def evaluate(argv: list[str]) -> int:
         "lengths": list(result.lengths),
         "num_cut": result.num_cut,
         "run_dir": str(options.run),
+        "parameters": "best" if options.best else "newest",
     }
     lines = [
         f"mean return {result.mean:.2f}" + ("" if error is None else f" ± {error:.2f} (standard error)")
@@ -99,7 +119,7 @@ def report(argv: list[str]) -> int:
     parser = command_parser("report", "Write a run's report.html (extra plot).", "neuralq report RUN")
     parser.add_argument("run", help="run folder")
     options = parser.parse_args(argv)
-    path = write_report(options.run)
+    path = write_report(single_run(options.run))
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
 
@@ -117,16 +137,26 @@ def _conclude(run: Run, as_json: bool, target: float | None) -> int:
     if run.interrupted_by is not None:
         _say(f"{run.interrupted_by}: saved at {run.env_steps:,} steps; go on with: neuralq resume {run.run_dir}")
     _say(run.resumability)
-    summary = {**run.summary(), "report": report_path}
+    best = _best_return(run)
+    summary = {**run.summary(), "best_return": best, "report": report_path}
     score = "not evaluated" if run.greedy_return is None else f"greedy return {run.greedy_return:.1f}"
     lines = [
         f"{run.env_steps:,} environment steps, {run.cpu_seconds:.2f} CPU-seconds of training, "
         f"{run.wall_seconds:.2f} seconds in all; {score}",
         f"run folder {run.run_dir}" + ("" if report_path is None else f", report {report_path}"),
     ]
+    if best is not None and run.greedy_return is not None and best > run.greedy_return:
+        lines.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
     print_result(summary, as_json, lines)
     if run.interrupted_by is not None:
         return 128 + signal.Signals[run.interrupted_by].value
     if run.reached is False:
         raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
     return 0
+
+
+def _best_return(run: Run) -> float | None:
+    try:
+        return load_best(run.run_dir).greedy_return
+    except CheckpointError:  # not evaluated yet
+        return None
