@@ -44,7 +44,7 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     Raises:
         ValueError: otherwise.
     """
-    if isinstance(value, bool) or int(value) != value or value < minimum:
+    if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < minimum:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 
 

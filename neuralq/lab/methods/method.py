@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 Options = Mapping[str, float]
 _LARGEST = 1e100
 """What every option stays below: its square is still a finite number."""
-_RANGES = {"lambda_": (0, 1), "phi": (0, 1), "eta": (0, _LARGEST), "num_steps": (1, 100_000), "period": (1, 1e9)}
+_RANGES = {"lambda_": (0, 1), "phi": (0, 1), "eta": (0, _LARGEST), "num_steps": (0, 100_000), "period": (0, 1e9)}
 """What options of a name mean is the same in every method, and so are their ranges; the rest is up to the method."""
 Piece = tuple[Floats, Floats]  # M [n, n] and c [n] of θ ← M θ + c
 
