@@ -256,6 +256,7 @@ LEARNERS: dict[str, list[str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_goes_with_every_learner(layout: str, learner: str, tmp_path: Path, capsys: Capture) -> None:

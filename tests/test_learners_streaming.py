@@ -400,7 +400,9 @@ def test_the_kernels_are_the_tensor_operations(name: str, bound: str) -> None:
 
 @pytest.mark.parametrize("cut", CUTS)
 @pytest.mark.parametrize("bound", BOUNDS)
-@pytest.mark.parametrize("layout", [*LAYOUTS, "linear", "masked"])
+@pytest.mark.parametrize(
+    "layout", [*(pytest.param(name, marks=pytest.mark.slow) for name in LAYOUTS), "linear", "masked"]
+)
 def test_every_layout_learns_the_same_either_way(layout: str, bound: str, cut: str) -> None:
     steps = stream(np.random.default_rng(7), (3,), 3, 100)
 

@@ -76,9 +76,16 @@ def config_of(layout: str, learner: str, kind: str, **more: Any) -> RunConfig:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ENVS)
-@pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize("layout", LAYOUTS)
+CELLS = [
+    # One layout sees every kind of observation in the fast lane, the others vectors; the rest of the grid is slow.
+    pytest.param(layout, learner, kind, marks=[] if kind == "vector" or layout == "action-output" else pytest.mark.slow)
+    for layout in LAYOUTS
+    for learner in LEARNERS
+    for kind in ENVS
+]
+
+
+@pytest.mark.parametrize(("layout", "learner", "kind"), CELLS)
 def test_it_trains_or_is_refused(layout: str, learner: str, kind: str) -> None:
     if layout == "table" and kind in TABLES:
         with pytest.raises(

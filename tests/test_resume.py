@@ -100,7 +100,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+SLOW = ("rollout, table", "rollout, linear, annealed", "replay, table", "replay, one-step", "online, table")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else []) for name in CASES])
 def test_a_run_stopped_anywhere_ends_as_if_it_had_not_been(name: str, tmp_path: Path) -> None:
     config = configuration(**CASES[name])
     whole = train(config, tmp_path / "whole")

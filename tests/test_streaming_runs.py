@@ -66,7 +66,12 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+QUICK = ("obgd", "intentional", "table", "vectorised twin")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CASES]
+)
 def test_a_run_stopped_anywhere_ends_as_if_it_had_not_been(name: str, tmp_path: Path) -> None:
     config = configured(**CASES[name])
     whole = train(config, tmp_path / "whole")

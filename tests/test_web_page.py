@@ -91,6 +91,7 @@ def test_the_star_turns_under_the_keyboard(page: Any, address: str) -> None:
     expect(page, "#critical", "0.88235294")  # 15/17
 
 
+@pytest.mark.slow
 def test_problem_and_method_change(page: Any, address: str) -> None:
     page.goto(address)
     expect(page, VERDICT, "diverges")
@@ -187,6 +188,7 @@ def test_the_keyboard_reaches_everything_and_shows_where_it_is(page: Any, addres
     assert unnamed == []
 
 
+@pytest.mark.slow
 def test_it_fits_a_phone_by_day_and_by_night(browser: Any, address: str) -> None:
     with browser.new_context(viewport={"width": 375, "height": 740}, is_mobile=True, has_touch=True) as context:
         page = context.new_page()
