@@ -100,6 +100,7 @@ def test_the_command_says_which_parameters_played(tmp_path: Path, capsys: pytest
         assert json.loads(capsys.readouterr().out)["parameters"] == named
 
 
+@pytest.mark.slow
 def test_the_end_of_a_run_names_a_best_that_was_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

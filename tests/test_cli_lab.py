@@ -149,6 +149,7 @@ def test_the_whole_grid_fits_narrow_and_wide_terminals(capsys: Capture, monkeypa
         assert max(map(len, text.splitlines())) <= int(width)
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(capsys: Capture) -> None:
     some = ["matrix", "--problem", "w2w", "--problem", "kolter", "--method", "td", "--method", "fitted"]
     assert answer(capsys, *some, "--jobs", "2") == answer(capsys, *some, "--jobs", "1")

@@ -61,6 +61,7 @@ def test_every_number_is_logged_at_its_step(tmp_path: Path, records: list[Record
     assert asked["dir"] == str(tmp_path / "run") and len(asked["id"]) == 16
 
 
+@pytest.mark.slow
 def test_a_run_and_its_continuation_are_one_record(tmp_path: Path, records: list[Record]) -> None:
     small = ["--preset", "false", "--rollout.num-envs", "2", "--rollout.num-steps", "16", "--hidden", "4"]
     small += ["--evaluation-episodes", "1", "--evaluate-every", "64", "--log-every", "32"]
