@@ -415,3 +415,17 @@ def test_stationary_distribution_of_two_separate_parts_is_refused() -> None:
         chains.stationary_distribution(model, np.ones((2, 1)))
     one = FiniteMDP.from_arrays([np.eye(2)], np.zeros((2, 1)), start=[0.0, 1.0])
     assert chains.stationary_distribution(one, np.ones((2, 1))).tolist() == [0, 1]
+
+
+def test_the_distribution_of_a_large_chain_is_stationary() -> None:
+    from neuralq.mdp import FiniteMDP
+    from neuralq_envs.counterexamples.chains import restarting_chain, stationary_distribution
+
+    wide = FiniteMDP.garnet(4000, 1, 5, seed=0)  # its factors would be almost dense
+    policy = np.ones((4000, 1))
+    d = stationary_distribution(wide, policy)
+    assert np.abs(d - restarting_chain(wide, policy).T @ d).sum() < 1e-13
+    assert d.sum() == pytest.approx(1, abs=1e-12)
+    ring = np.roll(np.eye(2100), 1, axis=1)  # never mixes by itself, and is narrow: d is uniform
+    around = FiniteMDP.from_arrays([ring], np.zeros((2100, 1)))
+    assert stationary_distribution(around, np.ones((2100, 1))) == pytest.approx(np.full(2100, 1 / 2100), rel=1e-9)

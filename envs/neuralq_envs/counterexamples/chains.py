@@ -12,6 +12,9 @@ from neuralq.mdp import FiniteMDP
 
 __all__ = ["restarting_chain", "stationary_distribution"]
 
+_LARGEST_FACTORED = 2000  # states up to which the equations are factored without a thought
+_MOST_STEPS = 5000
+
 
 def restarting_chain(mdp: FiniteMDP, policy: NDArray[np.float64]) -> sparse.csr_array:
     """The chain of non-terminal states under a policy when every episode that ends starts again, ``[S, S]``.
@@ -52,9 +55,8 @@ def stationary_distribution(mdp: FiniteMDP, policy: NDArray[np.float64]) -> NDAr
     recurrent = _recurrent_states(chain, mdp.start_distribution > 0)
     sub = chain[recurrent][:, recurrent]
     n = len(recurrent)
-    if n == 1:
-        share = np.ones(1)
-    else:  # d (I − P) = 0 without its last equation, the last entry held at 1
+    share = np.ones(n) if n <= 1 else _mixed(sub) if n > _LARGEST_FACTORED else None
+    if share is None:  # d (I − P) = 0 without its last equation, the last entry held at 1
         system = sparse.csc_array(sparse.eye_array(n) - sub).T.tocsc()
         head = splu(system[: n - 1, : n - 1]).solve(-system[: n - 1, [n - 1]].toarray().reshape(-1))
         share = np.append(head, 1.0)
@@ -62,6 +64,21 @@ def stationary_distribution(mdp: FiniteMDP, policy: NDArray[np.float64]) -> NDAr
     out[recurrent] = np.maximum(share, 0.0)
     distribution: NDArray[np.float64] = out / out.sum()
     return distribution
+
+
+def _mixed(chain: sparse.csr_array) -> NDArray[np.float64] | None:
+    """The distribution that a chain comes to, by steps of the lazy chain (P + I)/2; None where it mixes too slowly.
+
+    The factors of a large random graph would be almost dense; but such a graph mixes within some dozen steps.
+    """
+    back, share = sparse.csr_array(chain.T), np.full(chain.shape[0], 1 / chain.shape[0])
+    for _ in range(_MOST_STEPS):
+        moved = 0.5 * (share + back @ share)
+        moved /= moved.sum()
+        if np.abs(moved - share).sum() < 1e-15:
+            return np.asarray(moved)
+        share = moved
+    return None
 
 
 def _recurrent_states(chain: sparse.csr_array, start: NDArray[np.bool_]) -> NDArray[np.int64]:
