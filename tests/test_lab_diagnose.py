@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from neuralq.lab.diagnose import diagnose
 from neuralq.lab.methods import TD, Expected, Method
 from neuralq.lab.piecewise import follow
+from neuralq.lab.problems import problem as named
 from neuralq.lab.process import Process, linear_process
 from neuralq.lab.spectrum import first_crossing, flow_bound, limit_of, moving_spectrum
 from neuralq.lab.verdicts import is_poor
@@ -351,3 +352,12 @@ def test_large_and_sparse(lambda_: float) -> None:
     assert time.process_time() - begin < 10
     assert len(factors) == 1000
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2e6  # KiB
+
+
+@pytest.mark.parametrize("name", ["w2w", "gordon"])
+def test_an_error_that_dies_out_through_ever_new_pieces_has_converged(name: str) -> None:
+    # The adaptive φ does not depend on the size of w, so w shrinks by the same factor until it underflows; there φ is 0.
+    found = diagnose(named(name), "residual-adaptive")
+    assert found.verdict == "converges"
+    assert 0.98 < found.spectral_radius < 1
+    assert "halves every" in found.explain()

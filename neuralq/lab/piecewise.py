@@ -122,12 +122,14 @@ def follow(expected: Expected, theta: Floats, step_size: float, num_steps: int =
         ('chatters', [False, False])
     """
     walk = _Walk(expected, theta.astype(np.float64), step_size)
-    places = [walk.theta]
+    places, largest = [walk.theta], 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(num_steps):
             ahead = walk.piece[0] @ walk.theta + walk.piece[1]
             moved = np.abs(ahead - walk.theta).max(initial=0.0)
-            stays = walk.same(ahead)
+            stays, largest = walk.same(ahead), max(largest, moved)
+            if not stays and moved <= SETTLED * largest:  # before numbers underflow, and with them the piece
+                return Path("converges", walk.theta, walk.piece, walk.regions())
             far = MOST_LEAP if moved == 0 else walk.leap() if stays else 0
             if np.abs(walk.theta).max(initial=0.0) > walk.cap:
                 return Path("diverges", walk.theta, walk.piece, walk.regions())
