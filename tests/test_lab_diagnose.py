@@ -356,7 +356,7 @@ def test_large_and_sparse(lambda_: float) -> None:
 
 @pytest.mark.parametrize("name", ["w2w", "gordon"])
 def test_an_error_that_dies_out_through_ever_new_pieces_has_converged(name: str) -> None:
-    # The adaptive φ does not depend on the size of w, so w shrinks by the same factor until it underflows; there φ is 0.
+    # The adaptive φ does not depend on the size of w, so w shrinks until it underflows, and there φ is 0.
     found = diagnose(named(name), "residual-adaptive")
     assert found.verdict == "converges"
     assert 0.98 < found.spectral_radius < 1
