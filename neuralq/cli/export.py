@@ -96,16 +96,12 @@ class _Exported(nn.Module):
         self.q = agent.q
         self.scale = agent.reward_scale
         self.first_action = agent.first_action
-        seen = agent.normalisation
-        self.is_normalised = seen is not None and seen.observations
-        if seen is not None and seen.observations:
-            state = seen.state_dict()
-            count = float(state["observation_count"][0])
-            spread = (
-                state["observation_squares"] / (count - 1) if count > 1 else np.ones_like(state["observation_mean"])
-            )
-            self.register_buffer("mean", torch.as_tensor(state["observation_mean"].copy()))
-            self.register_buffer("inverse", torch.as_tensor(1.0 / np.sqrt(spread + 1e-8)))
+        scaling = None if agent.normalisation is None else agent.normalisation.scaling()
+        self.is_normalised = scaling is not None
+        if scaling is not None:
+            mean, inverse = scaling
+            self.register_buffer("mean", torch.as_tensor(mean))
+            self.register_buffer("inverse", torch.as_tensor(inverse))
 
     def forward(self, s: Tensor) -> tuple[Tensor, Tensor]:
         if self.is_normalised:

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuralq.lab.methods.gradient import Trace, corrected_flow, dot, has_trace, step_ratio, with_helpers
+from neuralq.lab.methods.chains import greedy_values
+from neuralq.lab.methods.gradient import corrected_flow, dot, has_trace, step_ratio, with_helpers
 from neuralq.lab.methods.method import Expected, Floats, Method, Options
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.lab.methods.trace import Trace
 from neuralq.lab.process import Index, Process
 from neuralq.lab.sampling import Sample
 
@@ -105,8 +107,8 @@ def greedy_rows(process: Process, w: Floats) -> Index:
         ([1], [0])
     """
     row_of = table_of_pairs(process, "a greedy policy")
-    value = np.where(row_of >= 0, (process.X @ w)[row_of], -np.inf)
-    best: Index = np.take_along_axis(row_of, np.argmax(value, axis=1)[:, None], axis=1)[:, 0]
+    best_action = greedy_values(process, row_of, w).argmax(axis=1)
+    best: Index = np.take_along_axis(row_of, best_action[:, None], axis=1)[:, 0]
     return best
 
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_whole
 from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
-from neuralq.lab.methods.gradient import Trace
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross, td
+from neuralq.lab.methods.trace import Trace
 from neuralq.lab.process import Process
 from neuralq.lab.sampling import Sample
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
 from neuralq.lab.methods.operators import naive_residual, td
+from neuralq.lab.methods.trace import Trace
 from neuralq.lab.process import Process
 from neuralq.lab.sampling import Sample
 
@@ -26,17 +27,12 @@ __all__ = ["NAIVE_RESIDUAL", "RESIDUAL", "TD"]
 class _TD:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta = w0.copy()
-        self._z = np.zeros_like(w0)
-        self._decay = np.zeros(len(w0))  # discount into the present row, times λ
-        self._lambda, self._eta = options["lambda_"], options["eta"]
+        self._trace, self._eta = Trace(w0.shape, options["lambda_"]), options["eta"]
 
     def update(self, sample: Sample, step_size: float) -> None:
         w = self.theta
-        decay = np.where(sample.begins, 0.0, self._decay)
-        self._z = sample.rho[:, None] * (decay[:, None] * self._z + sample.x)
-        delta = errors(w, sample)
-        w += step_size * (delta[:, None] * self._z - self._eta * w)
-        self._decay = sample.discount * self._lambda
+        z = self._trace.follow(sample, sample.rho)
+        w += step_size * (errors(w, sample)[:, None] * z - self._eta * w)
 
 
 class _Residual:
