@@ -14,8 +14,9 @@ With the hidden units h = σ(Wᵀx) and the outputs y = σ(Vh + c), four things 
 * the trace of an input that has not been seen for so long that λ to that power is below 1e-12 is dropped;
 * in the forward view errors are combined over the outputs first, so that there is nothing to keep per output.
 
-Weights are float32 or float64: ``w`` ``[199, H]``, one row per input, the last for the constant 1; ``v`` ``[K, H]``;
-``c`` ``[K]``. All scratch is in one `Scratch` tuple, made once.
+Weights are float32 or float64: ``w`` ``[199, H]``, one row per input, the last for the constant 1, and 14 rows more if
+the network is also shown the numbers of `neuralq_envs.backgammon.expert`; ``v`` ``[K, H]``; ``c`` ``[K]``. All scratch
+is in one `Scratch` tuple, made once.
 
 Sources: Tesauro (1992, 1995); Sutton (1988), eq. 4; Sutton & Barto (2018), section 16.1.
 """
@@ -28,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import kernel, reassociating_kernel
+from neuralq_envs.backgammon.expert import NUM_EXPERT, expert_inputs
 from neuralq_envs.backgammon.inputs import MAX_ACTIVE, NUM_INPUTS, tesauro_sparse
 from neuralq_envs.backgammon.rules import BAR, MAX_AFTERSTATES, START, Board, afterstates, result
 
@@ -44,8 +46,9 @@ class Scratch(NamedTuple):
     """What the kernels write to between two lines; nothing in it outlives a call."""
 
     boards: Board  # [MAX_AFTERSTATES, 2, 25]
-    indices: NDArray[np.int64]  # [32]
-    inputs: _Array  # [32]
+    indices: NDArray[np.int64]  # [46]
+    inputs: _Array  # [46]
+    expert: _Array  # [14]
     first: _Array  # [H] Wᵀx of the first afterstate
     hidden: _Array  # [H]
     y: _Array  # [K]
@@ -61,8 +64,9 @@ def new_scratch(num_hidden: int, num_outputs: int, dtype: Any) -> Scratch:
     """
     return Scratch(
         np.empty((MAX_AFTERSTATES, 2, 25), np.int8),
-        np.empty(MAX_ACTIVE + 1, np.int64),
-        np.empty(MAX_ACTIVE + 1, dtype),
+        np.empty(MAX_ACTIVE + 1 + NUM_EXPERT, np.int64),
+        np.empty(MAX_ACTIVE + 1 + NUM_EXPERT, dtype),
+        np.empty(NUM_EXPERT, dtype),
         np.empty(num_hidden, dtype),
         np.empty(num_hidden, dtype),
         np.empty(num_outputs, dtype),
@@ -114,6 +118,20 @@ def _sum_of_inputs(board: Board, w: _Array, indices: NDArray[np.int64], inputs: 
         for j in range(z.size):
             z[j] += x * w[row, j]
     return count + 1
+
+
+@kernel
+def _with_expert(board: Board, w: _Array, count: int, s: Scratch, z: _Array) -> int:
+    """Adds what the expert inputs give to z, if the network has them; writes them behind the ``count`` others."""
+    if len(w) == NUM_INPUTS + 1:
+        return count
+    expert_inputs(board, s.expert)
+    for i in range(NUM_EXPERT):
+        if s.expert[i] != 0:
+            s.indices[count], s.inputs[count] = NUM_INPUTS + 1 + i, s.expert[i]
+            _add_row(w, NUM_INPUTS + 1 + i, s.expert[i], z)
+            count += 1
+    return count
 
 
 @reassociating_kernel
@@ -182,6 +200,7 @@ def choose(count: int, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
         if left == 0:
             equity = float(result(s.boards[i]))
         else:
+            _with_expert(s.boards[i], w, 0, s, s.hidden)
             _sigmoids(s.hidden)
             _outputs(v, c, s.hidden, s.y)
             equity = equity_of(s.y)
@@ -196,7 +215,7 @@ def evaluate(boards: Board, w: _Array, v: _Array, c: _Array, s: Scratch, y: _Arr
 
     Args:
         boards: ``[n, 2, 25]``.
-        w: ``[199, H]``.
+        w: ``[199, H]`` or ``[213, H]``.
         v: ``[K, H]``.
         c: ``[K]``.
         s: scratch.
@@ -207,7 +226,7 @@ def evaluate(boards: Board, w: _Array, v: _Array, c: _Array, s: Scratch, y: _Arr
         if points != 0:
             _settled(points, y[i])
         else:
-            _sum_of_inputs(boards[i], w, s.indices, s.inputs, s.hidden)
+            _with_expert(boards[i], w, _sum_of_inputs(boards[i], w, s.indices, s.inputs, s.hidden), s, s.hidden)
             _sigmoids(s.hidden)
             _outputs(v, c, s.hidden, y[i])
 
@@ -348,7 +367,7 @@ def play_online(
         rates: the step size α of each game, ``[n]``.
         lambdas: λ in [0, 1] of each game, ``[n]``.
         rng: draws the dice.
-        w: ``[199, H]``; changed.
+        w: ``[199, H]`` or ``[213, H]``; changed.
         v: ``[K, H]``; changed.
         c: ``[K]``; changed.
         s: scratch.
@@ -356,10 +375,10 @@ def play_online(
     """
     num_outputs, num_hidden = v.shape
     dtype = w.dtype
-    zw = np.zeros((NUM_INPUTS + 1, num_outputs, num_hidden), dtype)
+    zw = np.zeros((len(w), num_outputs, num_hidden), dtype)
     zv = np.zeros((num_outputs, num_outputs, num_hidden), dtype)
     zc = np.zeros((num_outputs, num_outputs), dtype)
-    rows, ages = np.empty(NUM_INPUTS + 1, np.int64), np.full(NUM_INPUTS + 1, -1)
+    rows, ages = np.empty(len(w), np.int64), np.full(len(w), -1)
     before, after, step = np.empty(num_outputs, dtype), np.empty(num_outputs, dtype), np.empty(num_outputs, dtype)
     board = np.empty((2, 25), np.int8)
     plus = dtype.type(1.0)
@@ -373,6 +392,7 @@ def play_online(
         first_moves = True
         while True:
             count = _sum_of_inputs(board, w, s.indices, s.inputs, s.hidden)
+            count = _with_expert(board, w, count, s, s.hidden)
             _sigmoids(s.hidden)
             _outputs(v, c, s.hidden, s.y)
             sign = plus if first_moves or num_outputs > 1 else -plus
@@ -386,7 +406,8 @@ def play_online(
             if points != 0:
                 _settled(points, s.y)
             else:
-                _sum_of_inputs(board, w, s.indices, s.inputs, s.hidden)
+                count = _sum_of_inputs(board, w, s.indices, s.inputs, s.hidden)
+                _with_expert(board, w, count, s, s.hidden)
                 _sigmoids(s.hidden)
                 _outputs(v, c, s.hidden, s.y)
             _seen_by_first(s.y, first_moves, after)
@@ -413,7 +434,7 @@ def play_batch(
         num_games: how many.
         lambda_: λ in [0, 1].
         rng: draws the dice.
-        w: ``[199, H]``.
+        w: ``[199, H]`` or ``[213, H]``.
         v: ``[K, H]``.
         c: ``[K]``.
         gw: as ``w``; added to.
@@ -446,6 +467,7 @@ def play_batch(
         for t in range(turns - 1, -1, -1):
             _turn_around(returns)
             count = _sum_of_inputs(history[t], w, s.indices, s.inputs, s.hidden)
+            count = _with_expert(history[t], w, count, s, s.hidden)
             _sigmoids(s.hidden)
             _outputs(v, c, s.hidden, s.y)
             for k in range(num_outputs):

@@ -13,6 +13,7 @@ from safetensors.numpy import save_file
 
 from neuralq.backgammon.kernels import choose, evaluate, new_scratch
 from neuralq.checks import check_choice, check_positive, check_whole
+from neuralq_envs.backgammon.expert import NUM_EXPERT
 from neuralq_envs.backgammon.inputs import NUM_INPUTS
 from neuralq_envs.backgammon.rules import Board, afterstates
 
@@ -31,6 +32,7 @@ class ValueNetwork:
         num_hidden: hidden units H.
         num_outputs: 4 (plain win, gammon, plain loss, lost gammon) or 1 (win).
         dtype: float32 or float64.
+        expert: whether it is also shown the fourteen numbers of `neuralq_envs.backgammon.expert`.
 
     Raises:
         ValueError: for other numbers of outputs, other types, or no hidden unit.
@@ -42,14 +44,15 @@ class ValueNetwork:
         (8124, [[0.5, 0.5, 0.5, 0.5]])
     """
 
-    def __init__(self, num_hidden: int, num_outputs: int = 4, dtype: Any = np.float32) -> None:
+    def __init__(self, num_hidden: int, num_outputs: int = 4, dtype: Any = np.float32, expert: bool = False) -> None:
         check_whole("num_hidden", num_hidden)
         check_choice("num_outputs", num_outputs, (1, 4))
         self.dtype = np.dtype(dtype)
         check_choice("dtype", self.dtype.name, ("float32", "float64"))
-        sizes = np.cumsum([(NUM_INPUTS + 1) * num_hidden, num_outputs * num_hidden, num_outputs])
+        num_rows = NUM_INPUTS + 1 + (NUM_EXPERT if expert else 0)
+        sizes = np.cumsum([num_rows * num_hidden, num_outputs * num_hidden, num_outputs])
         self.flat: _Array = np.zeros(sizes[-1], self.dtype)
-        self.w: _Array = self.flat[: sizes[0]].reshape(NUM_INPUTS + 1, num_hidden)
+        self.w: _Array = self.flat[: sizes[0]].reshape(num_rows, num_hidden)
         self.v: _Array = self.flat[sizes[0] : sizes[1]].reshape(num_outputs, num_hidden)
         self.c: _Array = self.flat[sizes[1] :]
         self.scratch = new_scratch(num_hidden, num_outputs, self.dtype)
@@ -63,6 +66,7 @@ class ValueNetwork:
         *,
         scale: float = 0.1,
         dtype: Any = np.float32,
+        expert: bool = False,
     ) -> ValueNetwork:
         """A network with weights uniform in ±``scale``, and outputs without a bias.
 
@@ -71,7 +75,7 @@ class ValueNetwork:
             True
         """
         check_positive("scale", scale)
-        network = cls(num_hidden, num_outputs, dtype)
+        network = cls(num_hidden, num_outputs, dtype, expert)
         for weights in (network.w, network.v):
             weights[:] = rng.uniform(-scale, scale, weights.shape)
         return network
@@ -86,6 +90,11 @@ class ValueNetwork:
         """K, 4 or 1."""
         return len(self.c)
 
+    @property
+    def expert(self) -> bool:
+        """Whether it is shown more than Tesauro's inputs."""
+        return len(self.w) > NUM_INPUTS + 1
+
     def outputs(self, boards: Board) -> _Array:
         """Chances ``[n, K]`` of the sides to move in boards ``[n, 2, 25]``; certainties where the game is over."""
         y = np.empty((len(boards), self.num_outputs), self.dtype)
@@ -99,7 +108,7 @@ class ValueNetwork:
 
     def copy(self) -> ValueNetwork:
         """The same weights, with scratch of its own."""
-        other = ValueNetwork(self.num_hidden, self.num_outputs, self.dtype)
+        other = ValueNetwork(self.num_hidden, self.num_outputs, self.dtype, self.expert)
         other.flat[:] = self.flat
         return other
 
@@ -120,17 +129,19 @@ class ValueNetwork:
         """
         try:
             with safe_open(str(path), framework="numpy") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                tensors = {name: file.get_tensor(name) for name in file.keys()}
         except (OSError, SafetensorError) as error:
             raise ValueError(
                 f"{path} cannot be read as weights ({error}); train some: neuralq train td-gammon"
             ) from error
         shapes = {name: tensor.shape for name, tensor in tensors.items()}
         num_outputs, num_hidden = shapes.get("v", (0, 0))
-        expected = {"w": (NUM_INPUTS + 1, num_hidden), "v": (num_outputs, num_hidden), "c": (num_outputs,)}
+        expert = shapes.get("w") == (NUM_INPUTS + 1 + NUM_EXPERT, num_hidden)
+        num_rows = NUM_INPUTS + 1 + (NUM_EXPERT if expert else 0)
+        expected = {"w": (num_rows, num_hidden), "v": (num_outputs, num_hidden), "c": (num_outputs,)}
         if shapes != expected:
             raise ValueError(f"{path} holds no backgammon network: expected arrays w, v and c, got {shapes}")
-        network = cls(num_hidden, num_outputs, tensors["w"].dtype)
+        network = cls(num_hidden, num_outputs, tensors["w"].dtype, expert)
         network.w[:], network.v[:], network.c[:] = tensors["w"], tensors["v"], tensors["c"]
         return network
 

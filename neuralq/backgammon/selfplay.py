@@ -41,6 +41,7 @@ class SelfPlaySettings:
         num_games: games of the whole run, over which the schedules go.
         num_hidden: hidden units.
         num_outputs: 4 (plain win, gammon, plain loss, lost gammon), or 1 (win), which knows nothing of gammons.
+        inputs: "tesauro" (198 of the bare board) or "expert" (14 more, `neuralq_envs.backgammon.expert`).
         mode: "online" or "batched".
         lambda_: λ in [0, 1] at the beginning.
         lambda_end: λ at the end, linear in between; None keeps it.
@@ -58,6 +59,7 @@ class SelfPlaySettings:
     num_games: int = 300_000
     num_hidden: int = 80
     num_outputs: int = 4
+    inputs: str = "tesauro"
     mode: str = "online"
     lambda_: float = 0.7
     lambda_end: float | None = None
@@ -73,6 +75,7 @@ class SelfPlaySettings:
         for name in ("num_games", "num_hidden", "batch_games", "num_threads"):
             check_whole(name, getattr(self, name))
         check_choice("num_outputs", self.num_outputs, (1, 4))
+        check_choice("inputs", self.inputs, ("tesauro", "expert"))
         check_choice("mode", self.mode, ("online", "batched"))
         check_choice("dtype", self.dtype, ("float32", "float64"))
         check_fraction("lambda_", self.lambda_)
@@ -132,8 +135,9 @@ class SelfPlay:
         if settings.num_threads >= len(dice):
             raise ValueError(f"num_threads must be at most {len(dice)}, got {settings.num_threads}")
         self.network = ValueNetwork.drawn(
-            settings.num_hidden, settings.num_outputs, weights, scale=settings.weight_scale, dtype=settings.dtype
-        )
+            settings.num_hidden, settings.num_outputs, weights,
+            scale=settings.weight_scale, dtype=settings.dtype, expert=settings.inputs == "expert",
+        )  # fmt: skip
         self.num_games = 0
         self.tally = np.zeros(4, np.int64)  # plain games, gammons, backgammons, turns
         self._dice = dice[: settings.num_threads]
@@ -202,7 +206,9 @@ class _Batch:
         self.optimiser = FlatOptimiser(Optimiser("adam"), torch.from_numpy(network.flat))
         self._share = settings.batch_games // settings.num_threads
         shape = (settings.num_hidden, settings.num_outputs, network.dtype)
-        self._sums = [ValueNetwork(*shape) for _ in range(settings.num_threads)]  # gradients have the weights' shapes
+        self._sums = [
+            ValueNetwork(*shape, network.expert) for _ in range(settings.num_threads)
+        ]  # gradients have the weights' shapes
         self._scratch = [new_scratch(*shape) for _ in range(settings.num_threads)]
         self._tallies = np.zeros((settings.num_threads, 4), np.int64)
         self._pool = ThreadPoolExecutor(settings.num_threads) if settings.num_threads > 1 else None
