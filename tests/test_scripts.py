@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 
+from neuralq.record import RunFolder
+
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(path.name for path in (ROOT / "scripts").glob("*.py"))
 TWO_SEEDS = ["--total-steps=600", "--seeds=2", "--processes=1"]
@@ -169,3 +171,43 @@ def test_runs_as_a_user_runs_it(script: str, arguments: list[str], tmp_path: Pat
     ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout and not ran.stderr
+
+
+@pytest.mark.slow
+def test_td_gammon_study_keeps_the_best_step_size_and_draws_what_it_wrote(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("gnubg_nn", reason="gnubg-nn is not installed")
+    table, figure = tmp_path / "study.csv", tmp_path / "study.svg"
+    lines = run(
+        monkeypatch, capsys, "td_gammon_study.py", "--games=40", "--tune-games=4", "--seeds=1", "--lambdas", "0",
+        "--processes=1", "--match-games=2", f"--csv={table}", f"--svg={figure}",
+    )  # fmt: skip
+    tuned = {numbers(line)[1]: numbers(line)[4] for line in lines[:4]}
+    kept = numbers(lines[-1])[1]
+    assert tuned[kept] == max(tuned.values()) and len(table.read_text().splitlines()) == 1 + 4 + 6
+    first = figure.read_text()
+    again = run(monkeypatch, capsys, "td_gammon_study.py", f"--draw={table}", f"--svg={figure}")
+    assert again[-1].split()[:4] == lines[-1].split()[:4] and figure.read_text() == first
+
+
+def test_td_gammon_curve_has_a_row_for_each_evaluation_and_opponent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for seed in (1, 2):
+        with RunFolder.create(tmp_path / f"run{seed}", config={"kind": "td-gammon"}, seed=seed) as folder:
+            folder.append_metrics({"kind": "train", "env_steps": 50, "games": 1})
+            for games in (10, 20):
+                row: dict[str, float | str] = {"kind": "evaluation", "env_steps": 55 * games, "games": games}
+                for name, points in (("random", 2.5), ("pubeval", 0.01 * games)):
+                    row |= {f"ppg_{name}": points, f"ppg_{name}_standard_error": 0.1, f"win_rate_{name}": 0.6}
+                folder.append_metrics({**row, "cpu_seconds": 1.26})
+    runs = [str(tmp_path / "run1"), str(tmp_path / "run2")]
+    table, figure = tmp_path / "curve.csv", tmp_path / "curve.svg"
+    lines = run(monkeypatch, capsys, "td_gammon_curve.py", *runs, f"--csv={table}", f"--svg={figure}")
+    assert [line.split()[-3] for line in lines] == ["+0.200", "+2.500"] * 2
+    rows = table.read_text().splitlines()
+    assert len(rows) == 1 + 8 and rows[1:3] == ["1,10,1.3,random,2.5,0.1,0.6", "1,10,1.3,pubeval,0.1,0.1,0.6"]
+    first = figure.read_text()
+    run(monkeypatch, capsys, "td_gammon_curve.py", f"--draw={table}", f"--svg={figure}")
+    assert figure.read_text() == first and "against pubeval" not in first  # letters are drawn as paths

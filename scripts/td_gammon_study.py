@@ -1,0 +1,179 @@
+"""What λ is worth in backgammon, each λ with a step size of its own: points per game against pubeval.
+
+    pip install "neuralq[plot,gnubg]"
+    python scripts/td_gammon_study.py [--games 200000] [--tune-games 30000] [--seeds 2] [--csv F] [--svg F]
+
+First every λ is trained for ``--tune-games`` games with each of four step sizes, and the one that wins most from
+pubeval is kept; then it is trained with that one from other seeds for ``--games``, and measured on the way. Step sizes
+fall to a thirtieth over each run. All networks have Tesauro's 198 inputs, 80 hidden units and four outputs, learn
+online with traces, and play themselves only. Two processes by default.
+
+``--draw F`` draws the figure of a CSV that is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import multiprocessing
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuralq.backgammon import SelfPlay, SelfPlaySettings
+from neuralq.backgammon.match import play_match
+from neuralq.report.svg import COLOURS, MARKERS, draw_svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STEP_SIZES = {
+    0.0: (0.1, 0.2, 0.4, 0.8),
+    0.3: (0.1, 0.2, 0.4, 0.8),
+    0.7: (0.05, 0.1, 0.2, 0.4),
+    0.9: (0.02, 0.05, 0.1, 0.2),
+    1.0: (0.01, 0.02, 0.05, 0.1),
+}
+FALL = 30.0
+MATCH_SEED = 2_026
+COLUMNS = ("stage", "lambda", "step_size", "seed", "games", "points_per_game", "standard_error", "cpu_seconds")
+
+Row = dict[str, Any]
+Case = tuple[str, float, float, int, tuple[int, ...], int]
+
+
+def learn(case: Case) -> list[Row]:
+    """Trains for as many games as the last of ``stops`` says, and measures at each of them."""
+    stage, lambda_, step_size, seed, stops, match_games = case
+    settings = SelfPlaySettings(
+        num_games=stops[-1], lambda_=lambda_, step_size=step_size, step_size_end=step_size / FALL
+    )
+    learner, rows, spent = SelfPlay(settings, seed), [], 0.0
+    for before, stop in pairwise((0, *stops)):
+        start = time.process_time()
+        learner.play(stop - before)
+        spent += time.process_time() - start
+        match = play_match(learner.network, "pubeval", match_games, MATCH_SEED, duplicate=True)
+        figures = (match.points_per_game, match.standard_error, spent)
+        rows.append(dict(zip(COLUMNS, (stage, lambda_, step_size, seed, stop, *figures), strict=True)))
+    return rows
+
+
+def in_processes(cases: Sequence[Case], processes: int) -> Iterator[list[Row]]:
+    if processes == 1:
+        yield from map(learn, cases)
+        return
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(learn, case) for case in cases]):
+            yield future.result()
+
+
+def learn_all(cases: Sequence[Case], processes: int) -> list[Row]:
+    rows: list[Row] = []
+    for found in in_processes(cases, processes):
+        rows += found
+        last = rows[-1]
+        print(
+            f"{last['stage']:<6} λ {last['lambda']:<4} α {last['step_size']:<6} seed {last['seed']:<4} "
+            f"{last['games']:>9,} games  {last['points_per_game']:+.3f} ± {last['standard_error']:.3f}  "
+            f"{last['cpu_seconds']:.0f} CPU-s",
+            flush=True,
+        )
+    return sorted(rows, key=lambda row: [row[name] for name in COLUMNS[:5]])
+
+
+def best_step_sizes(rows: Sequence[Row]) -> dict[float, float]:
+    """The step size that won most, for each λ."""
+    best: dict[float, Row] = {}
+    for row in rows:
+        if row["stage"] == "tune":
+            held = best.setdefault(row["lambda"], row)
+            best[row["lambda"]] = max(held, row, key=lambda candidate: candidate["points_per_game"])
+    return {lambda_: row["step_size"] for lambda_, row in sorted(best.items())}
+
+
+def read(path: Path) -> list[Row]:
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{k: v if k == "stage" else float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+
+def write(rows: Sequence[Row], path: Path) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in row.items()})
+
+
+def paint(figure: Figure, rows: Sequence[Row]) -> None:
+    left, right = figure.subplots(1, 2)
+    for i, lambda_ in enumerate(sorted({row["lambda"] for row in rows})):
+        look = {"color": COLOURS[i], "marker": MARKERS[i], "label": f"λ = {lambda_:g}"}
+        tuned = [row for row in rows if row["stage"] == "tune" and row["lambda"] == lambda_]
+        left.plot([r["step_size"] for r in tuned], [r["points_per_game"] for r in tuned], **look)
+        main = [row for row in rows if row["stage"] == "learn" and row["lambda"] == lambda_]
+        games = sorted({row["games"] for row in main})
+        means = [statistics.mean(r["points_per_game"] for r in main if r["games"] == n) for n in games]
+        right.plot(games, means, **look)
+        for row in main:
+            right.plot(row["games"], row["points_per_game"], ".", color=COLOURS[i], alpha=0.4)
+    left.set(xscale="log", xlabel="step size at the start", ylabel="points per game against pubeval", title="Tuning")
+    right.set(xscale="log", xlabel="games of self-play", title="Mean over seeds, each λ with its step size")
+    right.axhline(0, color="#555555", linewidth=0.8)
+    right.legend()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        epilog="example: python scripts/td_gammon_study.py --games 20000 --tune-games 5000 --csv study.csv",
+    )
+    parser.add_argument("--games", type=int, default=200_000, help="of each run of the second stage (default 200,000)")
+    parser.add_argument("--tune-games", type=int, default=30_000, help="of each run of the first (default 30,000)")
+    parser.add_argument("--seeds", type=int, default=2, help="of the second stage (default 2)")
+    parser.add_argument("--match-games", type=int, default=4_000, help="of each measurement (default 4,000)")
+    parser.add_argument("--lambdas", type=float, nargs="+", choices=tuple(STEP_SIZES), default=tuple(STEP_SIZES))
+    parser.add_argument("--processes", type=int, default=2, help="runs at a time (default 2)")
+    parser.add_argument("--csv", type=Path, help="writes every measurement")
+    parser.add_argument("--svg", type=Path, help="draws tuning and learning curves")
+    parser.add_argument("--draw", type=Path, metavar="CSV", help="takes the measurements from this file")
+    options = parser.parse_args()
+    if options.draw is not None:
+        rows = read(options.draw)
+    else:
+        cases: list[Case] = [
+            ("tune", lambda_, step_size, 1, (options.tune_games,), options.match_games)
+            for lambda_ in options.lambdas
+            for step_size in STEP_SIZES[lambda_]
+        ]
+        rows = learn_all(cases, options.processes)
+        stops = tuple(options.games * share // 40 for share in (1, 2, 4, 10, 20, 40))
+        cases = [
+            ("learn", lambda_, step_size, seed, stops, options.match_games)
+            for lambda_, step_size in best_step_sizes(rows).items()
+            for seed in range(100, 100 + options.seeds)
+        ]
+        rows += learn_all(cases, options.processes)
+    if options.csv is not None:
+        write(rows, options.csv)
+        rows = read(options.csv)  # what is drawn is what was written
+    if options.svg is not None:
+        title = "What λ is worth in backgammon"
+        about = "Points per game against pubeval by step size, and by games of self-play for each λ with its step size."
+        drawn = draw_svg("td-gammon-lambda", title, about, (10, 4.2), lambda figure: paint(figure, rows))
+        options.svg.write_text(drawn + "\n", encoding="utf-8")
+    for lambda_ in sorted({row["lambda"] for row in rows}):
+        last = [row for row in rows if row["stage"] == "learn" and row["lambda"] == lambda_]
+        last = [row for row in last if row["games"] == max(row["games"] for row in last)]
+        if last:
+            mean = statistics.mean(row["points_per_game"] for row in last)
+            each = " ".join(f"{row['points_per_game']:+.3f}" for row in last)
+            print(f"λ {lambda_:<4} α {last[0]['step_size']:<6} {last[0]['games']:>9,.0f} games  {mean:+.3f}  ({each})")
+
+
+if __name__ == "__main__":
+    main()
