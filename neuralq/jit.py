@@ -19,13 +19,14 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 
-__all__ = ["kernel", "lean_kernel", "reassociating_kernel"]
+__all__ = ["kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 _njit: Any = numba.njit
 _said = False
+_REASSOCIATING = {"reassoc", "contract", "nsz", "arcp"}
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -79,7 +80,24 @@ def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
         >>> total(np.arange(4.0))
         6.0
     """
-    return _compile(function, fastmath={"reassoc", "contract", "nsz", "arcp"})
+    return _compile(function, fastmath=_REASSOCIATING)
+
+
+def lean_reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `lean_kernel` and `reassociating_kernel` at once.
+
+    Example:
+        >>> import numpy as np
+        >>> @lean_reassociating_kernel
+        ... def total(x: np.ndarray) -> float:
+        ...     result = 0.0
+        ...     for value in x:
+        ...         result += value
+        ...     return result
+        >>> total(np.arange(4.0))
+        6.0
+    """
+    return _compile(function, fastmath=_REASSOCIATING, _nrt=False)
 
 
 def _compile(function: Callable[P, R], **special: bool | set[str]) -> Callable[P, R]:

@@ -31,7 +31,7 @@ from neuralq.record import RunFolder
 from neuralq.snapshot import Resumability, encode_env, restore_env
 from neuralq.types import Transition
 
-__all__ = ["Diverged", "Hook", "Onlooker", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
+__all__ = ["Diverged", "Hook", "Onlooker", "Plan", "Progress", "Session", "StopRequest", "fit", "restore", "seed_for"]
 
 
 class Hook(Protocol):
@@ -162,8 +162,8 @@ def seed_for(seed: int, *purpose: int) -> int:
     return int(np.random.SeedSequence([seed, *purpose]).generate_state(1)[0] >> 1)
 
 
-class _StopRequest:
-    """Remembers SIGTERM and SIGINT, so that the loop can save before it ends."""
+class StopRequest:
+    """Remembers SIGTERM and SIGINT by ``name``, so that a loop can save before it ends."""
 
     def __init__(self) -> None:
         self.name: str | None = None
@@ -203,7 +203,7 @@ def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hoo
         Diverged: if the parameters stop being finite. Likewise.
     """
     loop = _Loop(session, plan, progress, folder, hooks)
-    request = _StopRequest()
+    request = StopRequest()
     with request.listening():
         try:
             loop.run(request)
@@ -249,7 +249,7 @@ class _Loop:
         self.progress.wall_seconds += time.perf_counter() - self._wall
         self._reset_clock()
 
-    def run(self, request: _StopRequest) -> None:
+    def run(self, request: StopRequest) -> None:
         session, plan, progress = self.session, self.plan, self.progress
         # A rollout that was begun is finished: half of one can be neither learned from nor saved.
         while progress.env_steps < plan.total_steps or not session.feed.between_samples:

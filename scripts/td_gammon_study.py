@@ -3,10 +3,12 @@
     pip install "neuralq[plot,gnubg]"
     python scripts/td_gammon_study.py [--games 200000] [--tune-games 30000] [--seeds 2] [--csv F] [--svg F]
 
-First every λ is trained for ``--tune-games`` games with each of four step sizes, and the one that wins most from
-pubeval is kept; then it is trained with that one from other seeds for ``--games``, and measured on the way. Step sizes
-fall to a thirtieth over each run. All networks have Tesauro's 198 inputs, 80 hidden units and four outputs, learn
-online with traces, and play themselves only. Two processes by default.
+First every λ is trained for ``--tune-games`` games with step sizes a factor of two apart, and more of them are tried as
+long as the best is at an end; the one that wins most from pubeval is kept. Then every λ is trained with its own from
+other seeds for ``--games``, and measured on the way. Step sizes fall to a thirtieth over each run. All networks have
+Tesauro's 198 inputs, 80 hidden units and four outputs, learn online with traces, and play themselves only.
+
+The CSV is written after every run, and what it already holds is not run again.
 
 ``--draw F`` draws the figure of a CSV that is there.
 """
@@ -31,12 +33,12 @@ from neuralq.report.svg import COLOURS, MARKERS, draw_svg
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STEP_SIZES = {
-    0.0: (0.1, 0.2, 0.4, 0.8),
-    0.3: (0.1, 0.2, 0.4, 0.8),
-    0.7: (0.05, 0.1, 0.2, 0.4),
-    0.9: (0.02, 0.05, 0.1, 0.2),
-    1.0: (0.01, 0.02, 0.05, 0.1),
+FIRST_STEP_SIZES = {
+    0.0: (0.2, 0.4, 0.8),
+    0.3: (0.2, 0.4, 0.8),
+    0.7: (0.1, 0.2, 0.4),
+    0.9: (0.05, 0.1),
+    1.0: (0.05, 0.1),
 }
 FALL = 30.0
 MATCH_SEED = 2_026
@@ -72,9 +74,10 @@ def in_processes(cases: Sequence[Case], processes: int) -> Iterator[list[Row]]:
             yield future.result()
 
 
-def learn_all(cases: Sequence[Case], processes: int) -> list[Row]:
-    rows: list[Row] = []
-    for found in in_processes(cases, processes):
+def learn_all(cases: Sequence[Case], rows: list[Row], processes: int, path: Path | None) -> None:
+    """Runs the cases that ``rows`` does not hold, and appends what they come to."""
+    known = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
+    for found in in_processes([case for case in cases if case[:4] not in known], processes):
         rows += found
         last = rows[-1]
         print(
@@ -83,17 +86,45 @@ def learn_all(cases: Sequence[Case], processes: int) -> list[Row]:
             f"{last['cpu_seconds']:.0f} CPU-s",
             flush=True,
         )
-    return sorted(rows, key=lambda row: [row[name] for name in COLUMNS[:5]])
+        if path is not None:
+            write(rows, path)
 
 
-def best_step_sizes(rows: Sequence[Row]) -> dict[float, float]:
-    """The step size that won most, for each λ."""
-    best: dict[float, Row] = {}
-    for row in rows:
-        if row["stage"] == "tune":
-            held = best.setdefault(row["lambda"], row)
-            best[row["lambda"]] = max(held, row, key=lambda candidate: candidate["points_per_game"])
-    return {lambda_: row["step_size"] for lambda_, row in sorted(best.items())}
+def tuned(rows: Sequence[Row], lambda_: float) -> dict[float, float]:
+    """Points per game by step size."""
+    mine = [row for row in rows if row["stage"] == "tune" and row["lambda"] == lambda_]
+    return {row["step_size"]: row["points_per_game"] for row in sorted(mine, key=lambda row: row["step_size"])}
+
+
+def best_step_size(rows: Sequence[Row], lambda_: float) -> float:
+    points = tuned(rows, lambda_)
+    return max(points, key=points.__getitem__)
+
+
+def beyond(points: dict[float, float]) -> list[float]:
+    """The next step size to try: none once the best has a smaller and a larger neighbour that are worse."""
+    sizes = list(points)
+    best = max(points, key=points.__getitem__)
+    return [sizes[0] / 2] if best == sizes[0] else [sizes[-1] * 2] if best == sizes[-1] else []
+
+
+def study(rows: list[Row], options: argparse.Namespace) -> None:
+    sizes = {lambda_: list(FIRST_STEP_SIZES[lambda_]) for lambda_ in options.lambdas}
+    while any(sizes.values()):
+        cases: list[Case] = [
+            ("tune", lambda_, step_size, 1, (options.tune_games,), options.match_games)
+            for lambda_, tried in sizes.items()
+            for step_size in tried
+        ]
+        learn_all(cases, rows, options.processes, options.csv)
+        sizes = {lambda_: beyond(tuned(rows, lambda_)) for lambda_ in options.lambdas}
+    stops = tuple(options.games * share // 40 for share in (1, 2, 4, 10, 20, 40))
+    cases = [
+        ("learn", lambda_, best_step_size(rows, lambda_), seed, stops, options.match_games)
+        for seed in range(100, 100 + options.seeds)
+        for lambda_ in options.lambdas
+    ]
+    learn_all(cases, rows, options.processes, options.csv)
 
 
 def read(path: Path) -> list[Row]:
@@ -105,7 +136,7 @@ def write(rows: Sequence[Row], path: Path) -> None:
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        for row in rows:
+        for row in sorted(rows, key=lambda row: [row[name] for name in COLUMNS[:5]]):
             writer.writerow({k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in row.items()})
 
 
@@ -113,8 +144,7 @@ def paint(figure: Figure, rows: Sequence[Row]) -> None:
     left, right = figure.subplots(1, 2)
     for i, lambda_ in enumerate(sorted({row["lambda"] for row in rows})):
         look = {"color": COLOURS[i], "marker": MARKERS[i], "label": f"λ = {lambda_:g}"}
-        tuned = [row for row in rows if row["stage"] == "tune" and row["lambda"] == lambda_]
-        left.plot([r["step_size"] for r in tuned], [r["points_per_game"] for r in tuned], **look)
+        left.plot(*zip(*tuned(rows, lambda_).items(), strict=True), **look)
         main = [row for row in rows if row["stage"] == "learn" and row["lambda"] == lambda_]
         games = sorted({row["games"] for row in main})
         means = [statistics.mean(r["points_per_game"] for r in main if r["games"] == n) for n in games]
@@ -136,7 +166,9 @@ def main() -> None:
     parser.add_argument("--tune-games", type=int, default=30_000, help="of each run of the first (default 30,000)")
     parser.add_argument("--seeds", type=int, default=2, help="of the second stage (default 2)")
     parser.add_argument("--match-games", type=int, default=4_000, help="of each measurement (default 4,000)")
-    parser.add_argument("--lambdas", type=float, nargs="+", choices=tuple(STEP_SIZES), default=tuple(STEP_SIZES))
+    parser.add_argument(
+        "--lambdas", type=float, nargs="+", choices=tuple(FIRST_STEP_SIZES), default=tuple(FIRST_STEP_SIZES)
+    )
     parser.add_argument("--processes", type=int, default=2, help="runs at a time (default 2)")
     parser.add_argument("--csv", type=Path, help="writes every measurement")
     parser.add_argument("--svg", type=Path, help="draws tuning and learning curves")
@@ -145,19 +177,8 @@ def main() -> None:
     if options.draw is not None:
         rows = read(options.draw)
     else:
-        cases: list[Case] = [
-            ("tune", lambda_, step_size, 1, (options.tune_games,), options.match_games)
-            for lambda_ in options.lambdas
-            for step_size in STEP_SIZES[lambda_]
-        ]
-        rows = learn_all(cases, options.processes)
-        stops = tuple(options.games * share // 40 for share in (1, 2, 4, 10, 20, 40))
-        cases = [
-            ("learn", lambda_, step_size, seed, stops, options.match_games)
-            for lambda_, step_size in best_step_sizes(rows).items()
-            for seed in range(100, 100 + options.seeds)
-        ]
-        rows += learn_all(cases, options.processes)
+        rows = read(options.csv) if options.csv is not None and options.csv.exists() else []
+        study(rows, options)
     if options.csv is not None:
         write(rows, options.csv)
         rows = read(options.csv)  # what is drawn is what was written

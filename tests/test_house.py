@@ -24,7 +24,10 @@ README = ROOT / "README.md"
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 40
 VAGUE_NAMES = {"utils", "common", "base", "manager", "data", "info"}
-KERNEL_DECORATORS = {"kernel", "lean_kernel", "reassociating_kernel", "jit", "njit", "vectorize", "guvectorize"}
+KERNEL_DECORATORS = {
+    *("kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel"),
+    *("jit", "njit", "vectorize", "guvectorize"),
+}
 # Functions that draw from, or seed, a generator that the whole process shares.
 TORCH_GLOBAL_DRAWS = {
     *("manual_seed", "seed", "rand", "randn", "randint", "randperm", "normal", "bernoulli", "multinomial", "poisson"),

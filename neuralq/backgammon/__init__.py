@@ -3,7 +3,23 @@
 from __future__ import annotations
 
 from neuralq.backgammon.agent import BackgammonAgent, Chances, RankedTurn
+from neuralq.backgammon.config import TdGammonConfig
+from neuralq.backgammon.match import MatchResult, play_match
 from neuralq.backgammon.network import ValueNetwork
+from neuralq.backgammon.run import load_agent, resume_games, train_games
 from neuralq.backgammon.selfplay import SelfPlay, SelfPlaySettings
 
-__all__ = ["BackgammonAgent", "Chances", "RankedTurn", "SelfPlay", "SelfPlaySettings", "ValueNetwork"]
+__all__ = [
+    "BackgammonAgent",
+    "Chances",
+    "MatchResult",
+    "RankedTurn",
+    "SelfPlay",
+    "SelfPlaySettings",
+    "TdGammonConfig",
+    "ValueNetwork",
+    "load_agent",
+    "play_match",
+    "resume_games",
+    "train_games",
+]

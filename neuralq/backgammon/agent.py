@@ -6,13 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neuralq.backgammon.network import ValueNetwork, equities
+from neuralq.backgammon.search import MAX_CANDIDATES, WINDOW, look_ahead
+from neuralq.checks import check_choice
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.position import check_dice
-from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, afterstates
+from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, Board, afterstates, result
 
 __all__ = ["BackgammonAgent", "Chances", "RankedTurn"]
+
+_Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +58,11 @@ class BackgammonAgent:
 
     Args:
         network: its values.
+        plies: 1 takes them as they are; 2 looks one roll further (`neuralq.backgammon.search`), which is some 30 times
+            the work.
+
+    Raises:
+        ValueError: other plies.
 
     Example:
         >>> agent = BackgammonAgent(ValueNetwork.drawn(40, 4, np.random.default_rng(0)))
@@ -61,8 +71,10 @@ class BackgammonAgent:
         True
     """
 
-    def __init__(self, network: ValueNetwork) -> None:
+    def __init__(self, network: ValueNetwork, plies: int = 1) -> None:
+        check_choice("plies", plies, (1, 2))
         self.network = network
+        self.plies = plies
 
     def equity(self, position: Position) -> float:
         """Points per game that the side to move, about to roll, expects: money play without a cube, in [−3, 3]."""
@@ -85,6 +97,9 @@ class BackgammonAgent:
     def ranked_turns(self, position: Position, dice: Sequence[int], num_turns: int | None = None) -> list[RankedTurn]:
         """The best ``num_turns`` afterstates, or all, with what the side to move expects of them; the best first.
 
+        At two plies the turns that have been looked into come before those that have not, which are too far behind
+        at one ply and keep what they were worth there.
+
         Raises:
             ValueError: dice that are not two numbers of 1 to 6, or a game that is over.
 
@@ -99,19 +114,37 @@ class BackgammonAgent:
             raise ValueError(f"the game is over, player {position.winner} has won; start from Position.initial()")
         boards = np.empty((MAX_AFTERSTATES, 2, 25), np.int8)
         boards = boards[: afterstates(position.board, die_1, die_2, boards)]
-        y = self.network.outputs(boards)
+        y = self.network.outputs(boards).astype(np.float64)
         others = equities(y)
-        turns = []
-        for i in np.argsort(others, kind="stable")[:num_turns]:
-            after = Position.from_board(boards[i], 1 - position.turn)
-            equity = float(after.points) if after.winner is not None else -float(others[i])
-            turns.append(RankedTurn(after, equity, _chances(y[i]).turned_around()))
-        return turns
+        for i in np.flatnonzero(boards[:, 1].sum(1) == 0):
+            others[i] = result(boards[i])
+        order = np.argsort(others, kind="stable")
+        if self.plies == 2:
+            order = self._look_into(boards, y, others, order)
+        return [
+            RankedTurn(
+                Position.from_board(boards[i], 1 - position.turn),
+                -float(others[i]),
+                _chances(y[i]).turned_around(),
+            )
+            for i in order[:num_turns]
+        ]
+
+    def _look_into(self, boards: Board, y: _Array, others: _Array, order: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Puts what two plies say of the best into ``y`` and ``others``, and returns the new order."""
+        net, best = self.network, order[:MAX_CANDIDATES]
+        best = best[others[best] <= others[order[0]] + WINDOW]
+        ours = np.empty(net.num_outputs)
+        for i in best:
+            if boards[i, 1].any():
+                others[i] = -look_ahead(boards[i], net.w, net.v, net.c, net.scratch, ours)
+                y[i] = 1.0 - ours if net.num_outputs == 1 else np.roll(ours, net.num_outputs // 2)
+        return np.concatenate([best[np.argsort(others[best], kind="stable")], order[len(best) :]])
 
 
 def _chances(y: np.ndarray[tuple[int], np.dtype[np.floating]]) -> Chances:
-    """Of the outputs of one position; the four chances are made to sum to 1, for nothing else does."""
+    """Of the outputs of one position; they are made to sum to 1, for nothing else does."""
     if y.size == 1:
         return Chances(float(y[0]), 0.0, 0.0)
-    plain, gammon, _, lost_gammon = (y / y.sum()).tolist()
-    return Chances(plain + gammon, gammon, lost_gammon)
+    won, lost = (y / y.sum()).reshape(2, -1)
+    return Chances(float(won.sum()), float(won[1:].sum()), float(lost[1:].sum()))

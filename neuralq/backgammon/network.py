@@ -30,7 +30,8 @@ class ValueNetwork:
 
     Args:
         num_hidden: hidden units H.
-        num_outputs: 4 (plain win, gammon, plain loss, lost gammon) or 1 (win).
+        num_outputs: 6 (plain win, gammon, backgammon, and the same lost), 4 (a backgammon counts as a gammon) or 1
+            (win).
         dtype: float32 or float64.
         expert: whether it is also shown the fourteen numbers of `neuralq_envs.backgammon.expert`.
 
@@ -46,7 +47,7 @@ class ValueNetwork:
 
     def __init__(self, num_hidden: int, num_outputs: int = 4, dtype: Any = np.float32, expert: bool = False) -> None:
         check_whole("num_hidden", num_hidden)
-        check_choice("num_outputs", num_outputs, (1, 4))
+        check_choice("num_outputs", num_outputs, (1, 4, 6))
         self.dtype = np.dtype(dtype)
         check_choice("dtype", self.dtype.name, ("float32", "float64"))
         num_rows = NUM_INPUTS + 1 + (NUM_EXPERT if expert else 0)
@@ -87,7 +88,7 @@ class ValueNetwork:
 
     @property
     def num_outputs(self) -> int:
-        """K, 4 or 1."""
+        """K: 6, 4 or 1."""
         return len(self.c)
 
     @property
@@ -104,7 +105,8 @@ class ValueNetwork:
     def best_afterstate(self, board: Board, die_1: int, die_2: int) -> Board:
         """The board ``[2, 25]`` to leave to the other side, of all in which a turn with these dice can end."""
         count = afterstates(board, die_1, die_2, self.scratch.boards)
-        return self.scratch.boards[choose(count, self.w, self.v, self.c, self.scratch)].copy()
+        best: Board = self.scratch.boards[choose(count, self.w, self.v, self.c, self.scratch)].copy()
+        return best
 
     def copy(self) -> ValueNetwork:
         """The same weights, with scratch of its own."""
@@ -147,7 +149,7 @@ class ValueNetwork:
 
 
 def equities(y: _Array) -> NDArray[np.float64]:
-    """Points that the side to move expects of outputs ``[..., K]``: y₀ + 2y₁ − y₂ − 2y₃, or 2y₀ − 1 where K = 1.
+    """Points that the side to move expects, from ``[..., K]``: Σₖ (k + 1)(yₖ − yₖ₊ₘ), m = K/2, or 2y₀ − 1 where K = 1.
 
     Example:
         >>> equities(np.array([[0.5, 0.25, 0.25, 0.0]])).tolist()
@@ -156,4 +158,6 @@ def equities(y: _Array) -> NDArray[np.float64]:
     y = np.asarray(y, np.float64)
     if y.shape[-1] == 1:
         return 2.0 * y[..., 0] - 1.0
-    return y[..., 0] + 2.0 * y[..., 1] - y[..., 2] - 2.0 * y[..., 3]
+    kinds = y.shape[-1] // 2
+    lead: NDArray[np.float64] = (y[..., :kinds] - y[..., kinds:]) @ np.arange(1.0, kinds + 1)
+    return lead

@@ -7,7 +7,9 @@ Two ways to learn from the same games:
 * batched: a batch of games is played with fixed weights, on as many cores as there are threads; the λ-returns of all
   turns are then fitted by one step of Adam along the mean gradient.
 
-On one core both are equal where the step size is so small that a game changes nothing (tests/test_backgammon_learning).
+Both run on compiled loops, or on PyTorch (`neuralq.backgammon.torch_engine`), which can use a GPU.
+
+The two are equal where the step size is so small that a game changes nothing (tests/test_backgammon_learning).
 
 Sources: Tesauro (1992), "Practical issues in temporal difference learning"; Tesauro (1995), "Temporal difference
 learning and TD-Gammon"; Sutton & Barto (2018), section 16.1.
@@ -25,12 +27,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuralq.backgammon.kernels import new_scratch, play_batch, play_online
+from neuralq.backgammon import torch_engine
+from neuralq.backgammon.kernels import new_scratch
+from neuralq.backgammon.learning_kernels import play_batch, play_online
 from neuralq.backgammon.network import ValueNetwork
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.optim import FlatOptimiser, Optimiser
 
-__all__ = ["SelfPlay", "SelfPlaySettings"]
+__all__ = ["MOST_THREADS", "SelfPlay", "SelfPlaySettings"]
+
+MOST_THREADS = 16
+
+# What did best of a few tried over 50,000 to 100,000 games with 80 hidden units (docs/td-gammon.md). Tesauro's own are
+# said to have been λ = 0.7 and α = 0.1.
+_STEP_SIZES = {"online": 0.3, "batched": 0.01}
+_FALL = 30.0
+_MOST_OF_ADAM = 0.1
 
 
 @dataclass(frozen=True)
@@ -40,17 +52,21 @@ class SelfPlaySettings:
     Args:
         num_games: games of the whole run, over which the schedules go.
         num_hidden: hidden units.
-        num_outputs: 4 (plain win, gammon, plain loss, lost gammon), or 1 (win), which knows nothing of gammons.
+        num_outputs: 6 (plain win, gammon, backgammon, and the same lost), 4 (as Tesauro: a backgammon counts as a
+            gammon), or 1 (win), which knows nothing of gammons.
         inputs: "tesauro" (198 of the bare board) or "expert" (14 more, `neuralq_envs.backgammon.expert`).
         mode: "online" or "batched".
         lambda_: λ in [0, 1] at the beginning.
         lambda_end: λ at the end, linear in between; None keeps it.
-        step_size: α at the beginning: of each turn's step (online), or Adam's (batched).
-        step_size_end: α at the end; in between it falls by the same factor in every game.
+        step_size: α at the beginning: of each turn's step (online, by default 0.3), or Adam's (batched, 0.01).
+        step_size_end: α at the end, by default a thirtieth; in between it falls by the same factor in every game.
         batch_games: games between two steps, shared evenly by the threads; batched mode only.
         num_threads: cores that play; more than one in batched mode only. Part of what a seed stands for.
         weight_scale: initial weights are uniform in ± this.
         dtype: "float32" or "float64".
+        engine: "compiled" or "torch" (`neuralq.backgammon.torch_engine`, which can use a GPU). The same
+            games and weights to rounding if online; batched, the dice of each game are drawn in another way.
+        device: where the torch engine computes: "cpu", "cuda", "cuda:1" and so on.
 
     Raises:
         ValueError: values outside their range, or that would be ignored.
@@ -61,33 +77,57 @@ class SelfPlaySettings:
     num_outputs: int = 4
     inputs: str = "tesauro"
     mode: str = "online"
-    lambda_: float = 0.7
+    lambda_: float = 0.3
     lambda_end: float | None = None
-    step_size: float = 0.1
-    step_size_end: float = 0.01
-    batch_games: int = 16
+    step_size: float = None  # type: ignore[assignment]  # never None once it is made
+    step_size_end: float = None  # type: ignore[assignment]
+    batch_games: int = 8
     num_threads: int = 1
     weight_scale: float = 0.1
     dtype: str = "float32"
+    engine: str = "compiled"
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         for name in ("num_games", "num_hidden", "batch_games", "num_threads"):
             check_whole(name, getattr(self, name))
-        check_choice("num_outputs", self.num_outputs, (1, 4))
+        check_choice("num_outputs", self.num_outputs, (1, 4, 6))
         check_choice("inputs", self.inputs, ("tesauro", "expert"))
         check_choice("mode", self.mode, ("online", "batched"))
         check_choice("dtype", self.dtype, ("float32", "float64"))
+        check_choice("engine", self.engine, ("compiled", "torch"))
         check_fraction("lambda_", self.lambda_)
         if self.lambda_end is not None:
             check_fraction("lambda_end", self.lambda_end)
+        if self.step_size is None:
+            object.__setattr__(self, "step_size", _STEP_SIZES[self.mode])
+        if self.step_size_end is None:
+            object.__setattr__(self, "step_size_end", self.step_size / _FALL)
         for name in ("step_size", "step_size_end", "weight_scale"):
             check_positive(name, getattr(self, name))
+        if self.mode == "batched" and self.step_size > _MOST_OF_ADAM:
+            raise ValueError(
+                f"batched mode takes steps of Adam, each as large as step_size: got {self.step_size}; "
+                f"use about {_STEP_SIZES['batched']}"
+            )
+        self._check_where_it_runs()
+
+    def _check_where_it_runs(self) -> None:
+        if self.engine == "compiled" and self.device != "cpu":
+            raise ValueError(f"the compiled engine runs on the CPU, got device={self.device!r}; use engine='torch'")
+        if self.engine == "torch" and self.num_threads > 1:
+            raise ValueError(
+                f"the torch engine plays a batch in lockstep, got num_threads={self.num_threads}; "
+                "leave it at 1 (torch.set_num_threads is what it heeds)"
+            )
         if self.mode == "online" and self.num_threads > 1:
             raise ValueError(
                 f"online learning is one game after another, got num_threads={self.num_threads}; "
                 "use mode='batched', or train several seeds side by side"
             )
+        if self.num_threads > MOST_THREADS:
+            raise ValueError(f"num_threads must be at most {MOST_THREADS}, got {self.num_threads}")
         if self.batch_games % self.num_threads != 0:
             raise ValueError(
                 f"batch_games={self.batch_games} games cannot be shared evenly by num_threads={self.num_threads}"
@@ -131,9 +171,9 @@ class SelfPlay:
     def __init__(self, settings: SelfPlaySettings, seed: int) -> None:
         check_whole("seed", seed, 0)
         self.settings = settings
-        weights, *dice = (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(17))
-        if settings.num_threads >= len(dice):
-            raise ValueError(f"num_threads must be at most {len(dice)}, got {settings.num_threads}")
+        weights, *dice = (
+            np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(1 + MOST_THREADS)
+        )
         self.network = ValueNetwork.drawn(
             settings.num_hidden, settings.num_outputs, weights,
             scale=settings.weight_scale, dtype=settings.dtype, expert=settings.inputs == "expert",
@@ -141,7 +181,9 @@ class SelfPlay:
         self.num_games = 0
         self.tally = np.zeros(4, np.int64)  # plain games, gammons, backgammons, turns
         self._dice = dice[: settings.num_threads]
-        self._batch = _Batch(self.network, settings) if settings.mode == "batched" else None
+        self._batch = _batch(self.network, settings) if settings.mode == "batched" else None
+        online = settings.mode == "online" and settings.engine == "torch"
+        self._torch = torch_engine.TorchValues(self.network, settings.device) if online else None
 
     def play(self, num_games: int) -> None:
         """Plays so many games and learns from them; in batched mode a multiple of ``batch_games``.
@@ -153,7 +195,12 @@ class SelfPlay:
         if self._batch is None:
             net, games = self.network, self.num_games + np.arange(num_games)
             rates, lambdas = self.settings.step_sizes(games), self.settings.lambdas(games)
-            play_online(rates, lambdas, self._dice[0], net.w, net.v, net.c, net.scratch, self.tally)
+            if self._torch is None:
+                play_online(rates, lambdas, self._dice[0], net.w, net.v, net.c, net.scratch, self.tally)
+            else:
+                self._torch.read(net)
+                torch_engine.play_online(self._torch, rates, lambdas, self._dice[0], self.tally)
+                self._torch.write(net)
             self.num_games += num_games
             return
         size = self.settings.batch_games
@@ -172,7 +219,7 @@ class SelfPlay:
             "num_games": self.num_games,
             "tally": self.tally.copy(),
             "dice": [rng.bit_generator.state for rng in self._dice],
-            "optimiser": None if self._batch is None else self._batch.optimiser.state_dict(),
+            "optimiser": None if self._batch is None else _copied(self._batch.optimiser.state_dict()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -196,6 +243,17 @@ class SelfPlay:
             rng.bit_generator.state = saved
         if self._batch is not None:
             self._batch.optimiser.load_state_dict(state["optimiser"])
+
+
+def _copied(state: dict[str, Any]) -> dict[str, Any]:
+    """A state that later steps do not change, on the CPU."""
+    return {name: value.cpu().clone() if isinstance(value, torch.Tensor) else value for name, value in state.items()}
+
+
+def _batch(network: ValueNetwork, settings: SelfPlaySettings) -> _Batch | torch_engine.TorchBatch:
+    if settings.engine == "torch":
+        return torch_engine.TorchBatch(network, settings.batch_games, settings.device)
+    return _Batch(network, settings)
 
 
 class _Batch:

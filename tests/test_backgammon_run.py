@@ -1,0 +1,251 @@
+"""Runs of TD-Gammon from the command line: what they leave, how they go on, and what they refuse.
+
+Faults looked for: the dice, the optimiser or the tally left out of the checkpoint · evaluation with the training
+dice · rows written twice after a kill · the next evaluation, row or checkpoint forgotten · the metrics of a killed run
+not cut back · schedules stretched by a new budget · weights of an old checkpoint loaded.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import neuralq
+from neuralq.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
+from neuralq.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
+from neuralq.backgammon.run import GammonRun, load_agent, resume_games, train_games
+from neuralq.cli import main
+from neuralq.record import RunFolderError, read_config, read_metrics, read_summary
+from neuralq_envs.backgammon import Position
+
+ROOT = Path(__file__).parents[1]
+CLOCKS = ("cpu_seconds", "wall_seconds", "games_per_second")
+SMALL = SelfPlaySettings(num_games=60, num_hidden=10, lambda_=0.7, lambda_end=0.2, step_size=0.1, step_size_end=0.01)
+MODES = {
+    "online": SMALL,
+    "batched, two threads": replace(SMALL, mode="batched", num_threads=2, batch_games=6, step_size=0.01),
+}
+each_mode = pytest.mark.parametrize("settings", MODES.values(), ids=MODES)
+
+
+class Stopped(BaseException):
+    """Ends a run in the middle as a kill would: nothing of the library catches it."""
+
+
+def configuration(settings: SelfPlaySettings, **given: Any) -> TdGammonConfig:
+    periods = {"evaluate_every": 25, "evaluation_games": 4, "checkpoint_every": 14, "log_every": 10}
+    return TdGammonConfig(settings, **{"seed": 3, **periods, **given})
+
+
+def at(games: int, then: Callable[[], None]) -> Callable[[Mapping[str, Any]], None]:
+    def hook(row: Mapping[str, Any]) -> None:
+        if row["kind"] == "train" and row["games"] == games:
+            then()
+
+    return hook
+
+
+def stop() -> None:
+    raise Stopped
+
+
+def clockless(path: Path) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if k not in CLOCKS} for row in read_metrics(path)]
+
+
+def outcome(run: GammonRun) -> tuple[Any, ...]:
+    return run.weights_sha256, run.games, run.env_steps, run.points_per_game
+
+
+@each_mode
+def test_a_run_stopped_anywhere_ends_as_if_it_had_not_been(settings: SelfPlaySettings, tmp_path: Path) -> None:
+    config = configuration(settings)
+    whole = train_games(config, tmp_path / "whole")
+    for games in (10, 42) if settings.mode == "batched" else (10, 40):  # before the first checkpoint, after the third
+        path = tmp_path / str(games)
+        begun = games if settings.mode == "online" else -(-games // 6) * 6
+        with pytest.raises(Stopped):
+            train_games(config, path, [at(begun, stop)])
+        assert outcome(resume_games(path)) == outcome(whole)
+        assert clockless(path) == clockless(tmp_path / "whole")
+    path = tmp_path / "asked"
+    asked = 30 if settings.mode == "batched" else 20  # between two checkpoints
+    first = train_games(config, path, [at(asked, lambda: os.kill(os.getpid(), signal.SIGTERM))])
+    assert (first.interrupted_by, first.games) == ("SIGTERM", asked)
+    assert outcome(resume_games(path)) == outcome(whole) and clockless(path) == clockless(tmp_path / "whole")
+    assert outcome(resume_games(path)) == outcome(whole)  # a finished run stays as it is
+
+
+def test_the_rows_say_what_the_games_were_and_the_weights_are_the_learners(tmp_path: Path) -> None:
+    config = configuration(SMALL)
+    run = train_games(config, tmp_path / "run")
+    learner = SelfPlay(SMALL, 3)
+    rows = [row for row in read_metrics(run.run_dir) if row["kind"] == "train"]
+    assert [row["games"] for row in rows] == [10, 20, 30, 40, 50, 60]
+    for row in rows:
+        before = learner.tally.copy()
+        learner.play(10)
+        played = learner.tally - before
+        assert row["turns_per_game"] == played[3] / 10 and row["gammon_rate"] == (played[1] + played[2]) / 10
+        assert row["env_steps"] == learner.tally[3]
+    assert run.weights_sha256 == learner.network.sha256()  # so evaluation took none of the training's dice
+    # 0.1 to 0.01 geometrically, 0.7 to 0.2 linearly: at half of the games their means
+    assert rows[2]["step_size"] == pytest.approx(10**-1.5) and rows[2]["lambda"] == pytest.approx(0.45)
+    evaluations = [row for row in read_metrics(run.run_dir) if row["kind"] == "evaluation"]
+    assert [row["games"] for row in evaluations] == [25, 50, 60]
+    last = evaluations[-1]["ppg_random"], evaluations[-1]["ppg_random_standard_error"]
+    assert run.points_per_game == {"random": last} and read_summary(run.run_dir)["points_per_game"]["random"] == [*last]
+    assert 0 < evaluations[0]["cpu_seconds"] <= evaluations[0]["wall_seconds"] * 1.5
+    assert ValueNetwork.load(run.run_dir / "weights.safetensors").sha256() == run.weights_sha256
+
+
+def test_a_larger_budget_keeps_the_schedules(tmp_path: Path) -> None:
+    config = configuration(SMALL, evaluate_against=())
+    longer = replace(config, num_games=80)
+    train_games(config, tmp_path / "a")
+    assert outcome(resume_games(tmp_path / "a", 80)) == outcome(train_games(longer, tmp_path / "b"))
+    assert read_config(tmp_path / "a") == read_config(tmp_path / "b")
+    assert read_metrics(tmp_path / "a")[-1]["step_size"] == pytest.approx(0.01)
+    batched = configuration(replace(MODES["batched, two threads"], num_games=10), evaluate_against=())
+    assert train_games(batched, tmp_path / "c").games == 12  # the last batch is played whole
+
+
+DOOMED = """
+import json, os, signal, sys
+from neuralq.backgammon.config import config_from_dict
+from neuralq.backgammon.run import train_games
+
+def die(row):
+    if row["games"] == 50:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+train_games(config_from_dict(json.loads(sys.argv[1])), sys.argv[2], [die])
+"""
+
+
+def test_a_killed_process_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = configuration(SMALL)
+    whole = train_games(config, tmp_path / "whole")
+    path = tmp_path / "killed"
+    arguments = [json.dumps(config_to_dict(config)), str(path)]
+    died = subprocess.run([sys.executable, "-c", DOOMED, *arguments], cwd=ROOT, check=False)
+    assert died.returncode == -signal.SIGKILL and not (path / "summary.json").exists()
+    assert read_metrics(path)[-1]["games"] == 50 and neuralq.load(path).network.sha256() != whole.weights_sha256
+    assert main(["resume", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["weights_sha256"] == whole.weights_sha256
+    assert clockless(path) == clockless(tmp_path / "whole")
+
+
+def test_the_command_line_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run"
+    options = f"--games 30 --hidden 10 --lambda 0.5 --seed 4 --evaluation-games 4 --run-dir {path} --json"
+    assert main(["train", "td-gammon", *shlex.split(options)]) == 0
+    shown = capsys.readouterr()
+    result = json.loads(shown.out.splitlines()[-1])
+    assert result["games"] == 30 and list(result["points_per_game"]) == ["random"] and str(path) in shown.err
+    assert read_config(path)["settings"]["lambda_"] == 0.5 and read_config(path)["kind"] == "td-gammon"
+    assert main(["resume", str(path), "--games", "40"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("40 games in ") and lines[1].startswith("against random: ") and str(path) in lines[-1]
+    copied = f"--config {path}/config.json --games 30 --run-dir {tmp_path / 'again'} --json"
+    assert main(["train", "td-gammon", *shlex.split(copied)]) == 0
+    assert json.loads(capsys.readouterr().out)["weights_sha256"] == result["weights_sha256"]
+
+
+def test_what_was_learned_plays(tmp_path: Path) -> None:
+    run = train_games(configuration(SMALL, evaluate_against=()), tmp_path / "run")
+    agent = neuralq.load(run.run_dir)
+    assert isinstance(agent, BackgammonAgent) and agent.network.sha256() == run.weights_sha256
+    start = Position.initial()
+    assert agent.best_move(start, (6, 1)) in start.afterstates((6, 1)) and -3 <= agent.equity(start) <= 3
+    assert load_agent(run.run_dir / "weights.safetensors").equity(start) == agent.equity(start)
+    with pytest.raises(ValueError, match="newest weights only"):
+        neuralq.load(run.run_dir, best=True)
+    with pytest.raises(ValueError, match="cannot be read as weights"):
+        load_agent(tmp_path / "nothing.safetensors")
+    with pytest.raises(RunFolderError, match="no TD-Gammon run"):
+        load_agent(tmp_path)
+    with pytest.raises(ValueError, match="TD-Gammon run"):
+        neuralq.resume(run.run_dir)
+
+
+def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:
+    def spoil(path: Path) -> None:
+        saved = neuralq.checkpoint.load_newest(path / "checkpoints")
+        saved.state["learner"]["weights"] = np.full_like(saved.state["learner"]["weights"], np.nan)
+        neuralq.checkpoint.save(path / "checkpoints", saved.step, saved.state)
+
+    run = train_games(configuration(SMALL), tmp_path / "run")
+    spoil(run.run_dir)
+    with pytest.raises(neuralq.training.Diverged, match="no longer finite"):
+        resume_games(run.run_dir, 70)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("--games 0", "--games must be a whole number of at least 1, got 0"),
+        ("--games many", "--games: invalid int value: 'many'"),
+        ("--hidden", "--hidden: expected one argument"),
+        ("--outputs 3", "--outputs must be one of 1, 4, 6, got 3"),
+        ("--lambda 1.5", "--lambda must lie in [0, 1], got 1.5"),
+        ("--lambda-end -0.1", "--lambda-end must lie in [0, 1]"),
+        ("--step-size 0", "--step-size must be a finite number above 0"),
+        ("--mode replay", "mode must be one of 'online', 'batched', got 'replay'"),
+        ("--threads 2", "use mode='batched'"),
+        ("--mode batched --threads 3", "--batch-games=8 games cannot be shared evenly by --threads=3"),
+        ("--against nobody", "--against must be one of 'random', 'pubeval', 'gnubg', got 'nobody'"),
+        ("--evaluation-games 1", "--evaluation-games must be a whole number of at least 2"),
+        ("--sparkle 3", "unknown: --sparkle 3"),
+        ("--config nowhere.json", "cannot read --config nowhere.json"),
+        ("100", "unknown: 100"),
+    ],
+)
+def test_bad_options_are_one_clear_error(options: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "td-gammon", *options.split()]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("neuralq: ") and expected in lines[0]
+
+
+def test_commands_for_other_runs_refuse_this_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = train_games(configuration(replace(SMALL, num_games=2), evaluate_against=()), tmp_path / "run").run_dir
+    commands = ("report", "compare", "watch", "record --gif a.gif", "export --onnx a.onnx", "resume --total-steps 9")
+    for command in (
+        *commands,
+        "resume --workers 2",
+        "resume --hook a:b",
+        "resume --games 0",
+        f"train td-gammon --run-dir {path}",
+    ):
+        words = command.split()
+        assert main([*words, *([] if words[0] == "train" else [str(path)])]) in (1, 2)
+        shown = capsys.readouterr()
+        lines = [line for line in shown.err.splitlines() if "preparing" not in line]
+        assert (
+            shown.out == ""
+            and len(lines) == 1
+            and ("TD-Gammon" in lines[0] or "--games" in lines[0] or "already" in lines[0])
+        )
+    with pytest.raises(ValueError, match="unknown in the configuration"):
+        config_from_dict({"kind": "td-gammon", "colour": "red"})
+
+
+def test_help_names_every_option_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "td-gammon", "--help"])
+    shown = capsys.readouterr().out
+    assert ended.value.code == 0 and "neuralq train td-gammon --games 100000 --seed 3" in shown
+    for option in ("games", "hidden", "outputs", "inputs", "mode", "lambda", "lambda-end", "step-size", "threads"):
+        assert f"--{option} " in shown
+    assert main(["train", "--help"]) == 0 and "neuralq train td-gammon" in capsys.readouterr().out
