@@ -1,12 +1,11 @@
 """A request for the lab, checked: what it may hold, and the words for what it may not.
 
-JSON knows no NaN and no infinity, though Python's reader does, and reads 1e999 as infinite; both are refused here, as
-are numbers where a word belongs, words where a number belongs, and names that mean nothing.
+Infinite numbers are refused, as are numbers where a word belongs, words where a number belongs, and names that mean
+nothing.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -15,47 +14,9 @@ from neuralq.lab.methods import METHODS, Method, method
 from neuralq.lab.problems import PROBLEMS
 from neuralq.web.catalogue import FIELDS, SAMPLINGS, critical_parameters, field_of
 
-__all__ = ["ANSWERS", "MAX_BODY_BYTES", "Malformed", "read_json", "read_request"]
-
-MAX_BODY_BYTES = 10_000
-"""Larger bodies are refused; the largest sensible one has a few hundred bytes."""
+__all__ = ["ANSWERS", "read_request"]
 
 Spec = dict[str, Any]
-
-
-class Malformed(ValueError):
-    """The body is no JSON object."""
-
-
-def read_json(body: bytes) -> Mapping[str, Any]:
-    """The object that the body holds.
-
-    Raises:
-        Malformed: no UTF-8, no JSON, NaN or infinity, too deeply nested, a name given twice, or not an object.
-
-    Example:
-        >>> read_json(b'{"gamma": NaN}')
-        Traceback (most recent call last):
-        neuralq.web.requests.Malformed: the body must be a JSON object: NaN is not a number of JSON
-    """
-
-    def refuse(word: str) -> None:
-        raise ValueError(f"{word} is not a number of JSON")
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):
-            raise ValueError("a name is given twice")
-        return found
-
-    try:
-        given = json.loads(body.decode("utf-8"), parse_constant=refuse, object_pairs_hook=once)
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits is a ValueError too
-        reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise Malformed(f"the body must be a JSON object: {reason}") from None
-    if not isinstance(given, dict):
-        raise Malformed(f"the body must be a JSON object, got {type(given).__name__}")
-    return given
 
 
 def read_request(kind: str, given: Mapping[str, Any]) -> Spec:

@@ -12,6 +12,7 @@ import socket
 import threading
 import warnings
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,9 @@ from neuralq.report import MissingExtra
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
-__all__ = ["LOOPBACK", "lab_app", "serve"]
+    from neuralq.web.play import Offer
+
+__all__ = ["LOOPBACK", "check_port", "lab_app", "need", "own_names", "play_app", "serve", "serve_app"]
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Names of this machine that no page of another site can take on."""
@@ -42,10 +45,33 @@ def lab_app(host: str = "127.0.0.1") -> Starlette:
         >>> [route.path for route in lab_app().routes][:2]
         ['/', '/plotly.min.js']
     """
-    _need("starlette", "plotly")
+    need("starlette", "plotly")
     from neuralq.web.app import application
 
-    return application(_own_names(host), any_address=_is_everywhere(host), plotly_script=_plotly_script())
+    names, any_address = own_names(host)
+    return application(names, any_address=any_address, plotly_script=_plotly_script())
+
+
+def play_app(offer: Offer, host: str = "127.0.0.1") -> Starlette:
+    """The page of a game and its API as an ASGI application.
+
+    Args:
+        offer: the game, such as `neuralq.web.play_tictactoe.tictactoe` gives.
+        host: as `lab_app` takes it.
+
+    Raises:
+        MissingExtra: starlette is not installed.
+
+    Example:
+        >>> from neuralq.web.play_tictactoe import tictactoe
+        >>> [route.path for route in play_app(tictactoe()).routes][:2]
+        ['/', '/api/start']
+    """
+    need("starlette", what="the page to play on")
+    from neuralq.web.play import play_application
+
+    names, any_address = own_names(host)
+    return play_application(offer, names, any_address=any_address)
 
 
 def serve(host: str = "127.0.0.1", port: int = 8765, *, open_browser: bool = False) -> None:
@@ -66,27 +92,60 @@ def serve(host: str = "127.0.0.1", port: int = 8765, *, open_browser: bool = Fal
         Traceback (most recent call last):
         ValueError: port must be at most 65535, got 65536
     """
-    check_whole("port", port, 0)
-    if port > 65535:
-        raise ValueError(f"port must be at most 65535, got {port}")
-    _need("starlette", "uvicorn", "plotly")
+    check_port(port)
+    need("starlette", "uvicorn", "plotly")
+    serve_app(lambda: lab_app(host), host, port, "The lab", open_browser=open_browser)
+
+
+def serve_app(
+    make: Callable[[], Starlette],
+    host: str,
+    port: int,
+    title: str,
+    *,
+    open_browser: bool = False,
+    announce: Callable[[str], None] | None = None,
+) -> None:
+    """Serve an application until interrupted.
+
+    Args:
+        make: makes it, after the address has been warned about.
+        host: as `serve` takes it.
+        port: 0 takes a free one.
+        title: what is served, as the first words of the line that says where it is.
+        open_browser: whether to show it in the default browser.
+        announce: called with the address instead of printing that line.
+
+    Raises:
+        ValueError: a port out of range.
+        OSError: the address cannot be had, such as a port that is in use.
+
+    Example:
+        >>> serve_app(lambda: lab_app(), "127.0.0.1", -1, "The lab")
+        Traceback (most recent call last):
+        ValueError: port must be a whole number of at least 0, got -1
+    """
+    check_port(port)
     import uvicorn
     from threadpoolctl import threadpool_limits
 
     if not _is_loopback(host):
         warnings.warn(
-            f"the lab is served on {host}, so whoever reaches this machine there can use it: there is no password and "
-            "no encryption. Use host='127.0.0.1' to keep it to yourself.",
-            stacklevel=2,
+            f"{title[0].lower()}{title[1:]} is served on {host}, so whoever reaches this machine there can use it: "
+            "there is no password and no encryption. Use host='127.0.0.1' to keep it to yourself.",
+            stacklevel=3,
         )
-    app = lab_app(host)
+    app = make()
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
         listener.listen()
         url = _address(host, listener.getsockname()[1])
-        print(f"The lab is at {url} (Ctrl-C ends it)", flush=True)
+        if announce is None:
+            print(f"{title} is at {url} (Ctrl-C ends it)", flush=True)
+        else:
+            announce(url)
         if open_browser:  # a moment later, when it answers
             threading.Timer(0.5, webbrowser.open, [url]).start()
         config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
@@ -95,12 +154,33 @@ def serve(host: str = "127.0.0.1", port: int = 8765, *, open_browser: bool = Fal
                 uvicorn.Server(config).run(sockets=[listener])
 
 
-def _need(*packages: str) -> None:
+def check_port(port: int) -> None:
+    """``port`` lies in 0..65535.
+
+    Raises:
+        ValueError: otherwise.
+
+    Example:
+        >>> check_port(0)
+    """
+    check_whole("port", port, 0)
+    if port > 65535:
+        raise ValueError(f"port must be at most 65535, got {port}")
+
+
+def need(*packages: str, what: str = "the lab's page") -> None:
+    """The packages of the extra ``web`` are installed.
+
+    Raises:
+        MissingExtra: one is not; the message says how to install it.
+
+    Example:
+        >>> need("json")
+    """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise MissingExtra(
-            f"the lab's page needs {' and '.join(missing)}, which is not installed; install it with: "
-            'pip install "neuralq[web]"'
+            f'{what} needs {" and ".join(missing)}, which is not installed; install it with: pip install "neuralq[web]"'
         )
 
 
@@ -132,11 +212,17 @@ def _is_everywhere(host: str) -> bool:
         return host == ""
 
 
-def _own_names(host: str) -> frozenset[str]:
+def own_names(host: str) -> tuple[frozenset[str], bool]:
+    """The names that a page served on ``host`` answers to, in lower case, and whether to every number as well.
+
+    Example:
+        >>> sorted(own_names("10.0.0.7")[0]), own_names("10.0.0.7")[1]
+        (['10.0.0.7', '127.0.0.1', '::1', 'localhost'], False)
+    """
     names = {*LOOPBACK, host.lower()}
     if _is_everywhere(host):
         names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-    return frozenset(names - {""})
+    return frozenset(names - {""}), _is_everywhere(host)
 
 
 def _address(host: str, port: int) -> str:
