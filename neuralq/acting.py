@@ -16,7 +16,7 @@ from torch import Tensor
 from neuralq.checks import check_fraction
 from neuralq.jit import kernel
 
-__all__ = ["choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
+__all__ = ["EpsilonGreedy", "choose_among", "choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
 
 _Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -52,6 +52,32 @@ def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -
     return -1
 
 
+def choose_among(q: _Array, epsilon: float, u: _Array) -> tuple[_Array, _Array]:
+    """As `choose_epsilon_greedy`, from arrays to arrays.
+
+    Example:
+        >>> a, mu = choose_among(np.array([[0.0, 2.0]]), 0.5, np.array([0.9]))
+        >>> a.tolist(), mu.tolist()
+        ([1], [0.75])
+    """
+    if not 0.0 <= epsilon <= 1.0:
+        check_fraction("epsilon", epsilon)
+    if q.ndim != 2 or u.shape != q.shape[:1]:
+        raise ValueError(
+            f"action values must be [N, A] with N uniform numbers, got {q.shape} and {u.shape}; "
+            "give a single observation a leading axis of one"
+        )
+    actions = np.empty(len(q), np.int64)
+    mu = np.empty(len(q), np.float32)
+    row = _choose(q, epsilon, u, actions, mu)
+    if row >= 0:
+        raise ValueError(
+            f"cannot choose an action in environment {row} from the values {q[row].tolist()}: NaN or inf means "
+            "that training diverged (try a smaller step size), all −inf that the action mask allows nothing"
+        )
+    return actions, mu
+
+
 def choose_epsilon_greedy(q: Tensor, epsilon: float, u: _Array) -> tuple[Tensor, Tensor]:
     """ε-greedy actions and the probability of each.
 
@@ -73,21 +99,7 @@ def choose_epsilon_greedy(q: Tensor, epsilon: float, u: _Array) -> tuple[Tensor,
         >>> a.tolist(), mu.tolist()
         ([1], [0.75])
     """
-    check_fraction("epsilon", epsilon)
-    values = q.detach().cpu().numpy()
-    if values.ndim != 2 or u.shape != values.shape[:1]:
-        raise ValueError(
-            f"action values must be [N, A] with N uniform numbers, got {tuple(values.shape)} and {u.shape}; "
-            "give a single observation a leading axis of one"
-        )
-    actions = np.empty(len(values), np.int64)
-    mu = np.empty(len(values), np.float32)
-    row = _choose(values, epsilon, u, actions, mu)
-    if row >= 0:
-        raise ValueError(
-            f"cannot choose an action in environment {row} from the values {values[row].tolist()}: NaN or inf means "
-            "that training diverged (try a smaller step size), all −inf that the action mask allows nothing"
-        )
+    actions, mu = choose_among(q.detach().cpu().numpy(), epsilon, u)
     return torch.from_numpy(actions), torch.from_numpy(mu)
 
 
@@ -101,23 +113,53 @@ def choose_greedy(q: Tensor) -> tuple[Tensor, Tensor]:
     return choose_epsilon_greedy(q, 0.0, np.zeros(len(q)))
 
 
-def epsilon_greedy_policy(
-    values: Callable[[Tensor], Tensor], epsilon: Callable[[], float], rng: np.random.Generator
-) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+class EpsilonGreedy:
     """A policy that draws from ``rng`` and looks up ε at every step.
 
     Args:
         values: observations ``[N, *obs]`` to action values ``[N, A]``.
         epsilon: the present ε, usually a schedule of a counter.
         rng: drawn from once per environment and step.
+        array_values: ``values`` from arrays to arrays, where the engine has it: a stream then asks `on_arrays`, and no
+            tensor is made for one step, which would cost as much as the values of a small network.
 
     Example:
-        >>> policy = epsilon_greedy_policy(lambda s: -s, lambda: 0.0, np.random.default_rng(0))
+        >>> policy = EpsilonGreedy(lambda s: -s, lambda: 0.0, np.random.default_rng(0))
         >>> policy(torch.tensor([[1.0, 0.0]]))[0].tolist()
         [1]
     """
 
-    def policy(s: Tensor) -> tuple[Tensor, Tensor]:
-        return choose_epsilon_greedy(values(s), epsilon(), rng.random(s.shape[0]))
+    def __init__(
+        self,
+        values: Callable[[Tensor], Tensor],
+        epsilon: Callable[[], float],
+        rng: np.random.Generator,
+        array_values: Callable[[_Array], _Array] | None = None,
+    ) -> None:
+        self._values, self._epsilon, self._rng = values, epsilon, rng
+        self._array_values = array_values
+        self.on_arrays = None if array_values is None else self._choose
 
-    return policy
+    def __call__(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions ``[N]`` and the probability of each."""
+        return choose_epsilon_greedy(self._values(s), self._epsilon(), self._rng.random(s.shape[0]))
+
+    def _choose(self, s: _Array) -> tuple[_Array, _Array]:
+        """The same for an array of observations, with the same draws."""
+        assert self._array_values is not None
+        return choose_among(self._array_values(s), self._epsilon(), self._rng.random(len(s)))
+
+
+def epsilon_greedy_policy(
+    values: Callable[[Tensor], Tensor],
+    epsilon: Callable[[], float],
+    rng: np.random.Generator,
+    array_values: Callable[[_Array], _Array] | None = None,
+) -> EpsilonGreedy:
+    """A policy that draws from ``rng`` and looks up ε at every step; arguments as for `EpsilonGreedy`.
+
+    Example:
+        >>> epsilon_greedy_policy(lambda s: s, lambda: 0.0, np.random.default_rng(0))(torch.tensor([[1.0, 0.0]]))[0]
+        tensor([0])
+    """
+    return EpsilonGreedy(values, epsilon, rng, array_values)

@@ -82,8 +82,8 @@ def _scale(g: _Array, factor: float) -> None:
         g[i] *= f
 
 
-def clip_norm_(grad: Tensor, max_norm: float) -> None:
-    """Scale ``grad`` in place so that its Euclidean norm is at most ``max_norm``.
+def clip_norm_(grad: Tensor | _Array, max_norm: float) -> None:
+    """Scale ``grad``, a tensor or an array, in place so that its Euclidean norm is at most ``max_norm``.
 
     Example:
         >>> g = torch.tensor([3.0, 4.0])
@@ -91,10 +91,11 @@ def clip_norm_(grad: Tensor, max_norm: float) -> None:
         >>> g.tolist()
         [0.6000000238418579, 0.800000011920929]
     """
-    if grad.device.type == "cpu":
-        norm = math.sqrt(_square_sum(grad.numpy()))
+    if not isinstance(grad, Tensor) or grad.device.type == "cpu":
+        array = grad.numpy() if isinstance(grad, Tensor) else grad
+        norm = math.sqrt(_square_sum(array))
         if norm > max_norm:
-            _scale(grad.numpy(), max_norm / norm)
+            _scale(array, max_norm / norm)
         return
     grad.mul_(torch.clamp(max_norm / torch.linalg.vector_norm(grad), max=1.0))
 
@@ -120,21 +121,24 @@ class FlatOptimiser:
         moments = optimiser.kind != "sgd"
         self._m = torch.zeros_like(values) if moments else None
         self._v = torch.zeros_like(values) if moments else None
+        self._arrays: tuple[_Array, _Array, _Array] | None = None  # the same memory, on CPUs
+        if self._m is not None and self._v is not None and values.device.type == "cpu":
+            self._arrays = values.numpy(), self._m.numpy(), self._v.numpy()
 
-    def step(self, grad: Tensor, learning_rate: float) -> None:
-        """One descent step along ``grad``."""
+    def step(self, grad: Tensor | _Array, learning_rate: float) -> None:
+        """One descent step along ``grad``; on a CPU it may be an array."""
         self.num_steps += 1
+        if self._arrays is not None:
+            p, m, v = self._arrays
+            o, g = self.optimiser, grad.numpy() if isinstance(grad, Tensor) else grad
+            _moments_kernel(p, g, m, v, o.beta1, o.beta2, *self._scales(learning_rate))
+            return
+        grad = grad if isinstance(grad, Tensor) else torch.from_numpy(grad)
         if self._m is None or self._v is None:
             self.values.add_(grad, alpha=-learning_rate)
             return
         rate, root, eps, plain = self._scales(learning_rate)
         o = self.optimiser
-        if self.values.device.type == "cpu":
-            _moments_kernel(
-                self.values.numpy(), grad.numpy(), self._m.numpy(), self._v.numpy(),
-                o.beta1, o.beta2, rate, root, eps, plain,
-            )  # fmt: skip
-            return
         self._m.lerp_(grad, 1 - o.beta1)
         self._v.mul_(o.beta2).addcmul_(grad, grad, value=1 - o.beta2)
         if plain:

@@ -12,12 +12,12 @@ says how busy or slow this machine is. Training only: building, compiling and ev
 rounds; for example:
 
     learner                    ours [steps/CPU-s]   peer [steps/CPU-s]   ratio   peer
-    rollout, 4 x 128                       12,422                7,000    1.8x   CleanRL PQN, quiet machine
-    rollout, 64 x 128                      64,784               26,000    2.5x   CleanRL PQN, quiet machine
-    replay, 1 environment                   2,403                  348    6.9x   SB3 DQN, alternating
-    SB3 made 348 where a quiet machine makes 935; at equal speed the ratios would be:
-    rollout, 4 x 128                                                      4.8x
-    rollout, 64 x 128                                                     6.7x
+    rollout, 4 x 128                       75,893                7,000   10.8x   CleanRL PQN, quiet machine
+    rollout, 64 x 128                     179,022               26,000    6.9x   CleanRL PQN, quiet machine
+    replay, 1 environment                  13,214                  460   28.7x   SB3 DQN, alternating
+    SB3 made 460 where a quiet machine makes 935; at equal speed the ratios would be:
+    rollout, 4 x 128                                                     22.0x
+    rollout, 64 x 128                                                    14.0x
 
 ``--json`` prints one JSON object as the last line: ``{"rollout, 4 x 128": {"ours": ..., "peer": ..., "ratio": ...}}``.
 """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -23,7 +23,11 @@ _Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Policy(Protocol):
-    """Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``."""
+    """Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``.
+
+    A policy with an ``on_arrays`` that is not None is asked there, arrays in and arrays out, which spares a tensor or
+    two per step; `neuralq.acting.EpsilonGreedy` has one.
+    """
 
     def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
         """Actions and their probabilities."""
@@ -64,8 +68,7 @@ class Episode:
     length: int
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """One step of a batch of environments, with one row for each lane that really moved.
 
     Args:
@@ -121,6 +124,7 @@ class Interaction:
             inner.envs = [e if isinstance(e, Lane) else Lane(e, i) for i, e in enumerate(inner.envs)]
         self.num_steps = 0
         self._everyone = np.arange(self.num_envs)
+        self._discounts = np.full(self.num_envs, self.discount)
         self._broken = False
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
@@ -219,8 +223,7 @@ class Interaction:
         """
         if self._broken:
             raise EnvironmentFault("this interaction has ended with an error; start a new one")
-        action, mu = policy(torch.from_numpy(self._s))
-        chosen = action.numpy()
+        chosen, mu = _act(policy, self._s)
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
         except Exception as error:
@@ -234,8 +237,8 @@ class Interaction:
         fake = self._pending
         everyone = np.count_nonzero(fake) == 0
         lanes = self._everyone if everyone else np.flatnonzero(~fake)
-        discount_t = np.where(terminated, 0.0, self.discount)
-        rows: tuple[_Array, ...] = (self._s, chosen, mu.numpy(), r_t, discount_t, s_t, last)
+        discount_t = np.where(terminated, 0.0, self.discount) if ended else self._discounts.copy()
+        rows: tuple[_Array, ...] = (self._s, chosen, mu, r_t, discount_t, s_t, last)
         if self.normalisation is not None:
             rows = (*rows[:3], self.normalisation.reward(r_t, last, ~fake), *rows[4:])
         if not everyone:
@@ -329,6 +332,14 @@ class Interaction:
         """Of `state_dict`, the statistics alone: they stay true where the episodes have to start anew."""
         if self.normalisation is not None:
             self.normalisation.load_state_dict(state["normalisation"])
+
+
+def _act(policy: Policy, s: _Array) -> tuple[_Array, _Array]:
+    on_arrays = getattr(policy, "on_arrays", None)
+    if on_arrays is not None:
+        return on_arrays(s)  # type: ignore[no-any-return]
+    action, mu = policy(torch.from_numpy(s))
+    return action.numpy(), mu.numpy()
 
 
 def _describe_error(error: Exception) -> str:

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuralq import rules
-from neuralq.learners.bootstrap import q_learning_targets
+from neuralq.learners.bootstrap import q_learning_array_targets, q_learning_targets
 from neuralq.learners.replay_settings import CORRECTED_RULES, ReplaySettings
 from neuralq.learners.update import Descent, Update
 from neuralq.optim import Optimiser
@@ -23,6 +24,8 @@ from neuralq.q.engine import Engine
 from neuralq.types import Transition
 
 __all__ = ["ReplayLearner"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class ReplayLearner:
@@ -59,6 +62,8 @@ class ReplayLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._seen: Transition | None = None
+        self._seen_arrays: tuple[_Array, ...] | None = None
         engine.sync_target()
         one = torch.ones(1, dtype=engine.flat.values.dtype)
         q_learning_targets(one, one, one[:, None])  # compiled here, so that a run's clock measures training
@@ -105,16 +110,46 @@ class ReplayLearner:
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One descent step on a batch; ``weight``, shaped like ``r_t``, multiplies each sample's loss."""
+        arrays = self._arrays_of(transition)
+        if arrays is not None:
+            return self._update_arrays(arrays, None if weight is None else weight.to(transition.r_t.dtype).numpy())
         targets = self.targets(transition)
         s, a = transition.s_tm1, transition.a_tm1
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)
         errors = self._descent.step(s, a, targets, weight)
+        self._count()
+        return Update(errors, targets)
+
+    def _arrays_of(self, transition: Transition) -> tuple[_Array, ...] | None:
+        """Observation, action, reward, discount and successor as arrays, where the quick way applies.
+
+        A replay buffer hands out the same tensors every time, so their arrays are made once.
+        """
+        if transition is not self._seen:
+            self._seen, self._seen_arrays = transition, None
+            t, dtype = transition, self.engine.flat.values.dtype
+            plain = self._descent.on_arrays is not None and self.settings.target_rule == "q_learning"
+            alike = t.r_t.dtype == t.discount_t.dtype == dtype and t.r_t.shape == t.discount_t.shape == t.a_tm1.shape
+            if plain and alike and t.r_t.dim() == 1 and len(t.s_tm1) == len(t.s_t) == len(t.r_t):
+                self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))
+        return self._seen_arrays
+
+    def _update_arrays(self, arrays: tuple[_Array, ...], weight: _Array | None) -> Update:
+        """`update` by one-step Q-learning, without tensors."""
+        s_tm1, a_tm1, r_t, discount_t, s_t = arrays
+        assert self._descent.on_arrays is not None
+        q_t = self._descent.on_arrays.all_arrays(s_t, target=True)
+        targets = q_learning_array_targets(r_t, discount_t, q_t, self.reward_scale)
+        errors = self._descent.step_arrays(s_tm1, a_tm1, targets, weight)
+        self._count()
+        return Update(torch.from_numpy(errors), torch.from_numpy(targets))
+
+    def _count(self) -> None:
         self.num_updates += 1
         if self.num_updates % (self.settings.target_period_updates or 1) == 0:
             self.engine.sync_target()
-        return Update(errors, targets)
 
     def begin_streams(self) -> None:
         """Nothing connects one sample to the next."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.jit import kernel
 
-__all__ = ["q_learning_targets"]
+__all__ = ["q_learning_array_targets", "q_learning_targets"]
 
 _Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -53,6 +53,16 @@ def q_learning_targets(r_t: Tensor, discount_t: Tensor, q_t: Tensor, reward_scal
     r_t, discount_t = r_t.to(q_t.dtype), discount_t.to(q_t.dtype)
     if q_t.device.type != "cpu" or q_t.dim() != 2 or r_t.shape != q_t.shape[:1] or discount_t.shape != r_t.shape:
         return rules.q_learning(r_t * reward_scale, discount_t, q_t)
-    out = np.empty(len(r_t), q_t.numpy().dtype)
-    _targets(r_t.numpy(), discount_t.numpy(), q_t.numpy(), reward_scale, out)
-    return torch.from_numpy(out)
+    return torch.from_numpy(q_learning_array_targets(r_t.numpy(), discount_t.numpy(), q_t.numpy(), reward_scale))
+
+
+def q_learning_array_targets(r_t: _Array, discount_t: _Array, q_t: _Array, reward_scale: float = 1.0) -> _Array:
+    """As `q_learning_targets` from arrays ``[B]``, ``[B]`` and ``[B, A]`` of one precision.
+
+    Example:
+        >>> q_learning_array_targets(np.array([1.0]), np.array([0.5]), np.array([[4.0, 8.0]])).tolist()
+        [5.0]
+    """
+    out = np.empty(len(r_t), q_t.dtype)
+    _targets(r_t, discount_t, q_t, reward_scale, out)
+    return out

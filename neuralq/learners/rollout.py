@@ -24,6 +24,8 @@ from neuralq.types import Transition
 
 __all__ = ["RolloutLearner", "RolloutSettings"]
 
+_Array = np.ndarray[Any, np.dtype[Any]]
+
 
 @dataclass(frozen=True)
 class RolloutSettings:
@@ -154,10 +156,9 @@ class RolloutLearner:
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Fit one rollout ``[T, N]``; rows of weight 0 (an autoreset's step that was never taken) are left out."""
         targets = self.targets(transition).reshape(-1)
-        s = transition.s_tm1.flatten(0, 1)
-        a = transition.a_tm1.reshape(-1)
         rows = None if weight is None else weight.reshape(-1).nonzero()[:, 0].cpu().numpy()
         num_rows = len(targets) if rows is None else len(rows)
+        fit = self._fit_tensors if self._descent.on_arrays is None else self._fit_arrays
         errors = picked = targets
         annealed = 1.0
         if self.total_updates is not None:
@@ -167,19 +168,39 @@ class RolloutLearner:
                 targets = self.targets(transition).reshape(-1)
             order = self.rng.permutation(num_rows)
             order = order if rows is None else rows[order]
-            for part in np.array_split(order, self.settings.num_minibatches):
-                if len(part) == 0:
-                    continue
-                index = torch.from_numpy(part).to(targets.device)
-                picked = targets[index]
-                errors = self._descent.step(s[index], a[index], picked, None, annealed)
-                if self._average is not None:
-                    self._average.follow()
+            parts = [part for part in np.array_split(order, self.settings.num_minibatches) if len(part)]
+            errors, picked = fit(transition, targets, parts, annealed) if parts else (errors, picked)
         self.num_updates += 1
         period = self.settings.target_period_updates
         if period is not None and self.num_updates % period == 0:
             self.engine.sync_target()
         return Update(errors, picked)
+
+    def _fit_tensors(
+        self, transition: Transition, targets: Tensor, parts: list[_Array], annealed: float
+    ) -> tuple[Tensor, Tensor]:
+        """A gradient step for each part of the rows; errors and targets of the last."""
+        s, a = transition.s_tm1.flatten(0, 1), transition.a_tm1.reshape(-1)
+        for part in parts:
+            index = torch.from_numpy(part).to(targets.device)
+            picked = targets[index]
+            errors = self._descent.step(s[index], a[index], picked, None, annealed)
+            if self._average is not None:
+                self._average.follow()
+        return errors, picked
+
+    def _fit_arrays(
+        self, transition: Transition, targets: Tensor, parts: list[_Array], annealed: float
+    ) -> tuple[Tensor, Tensor]:
+        """The same without making tensors of each part, which for small networks costs as much as a fifth of it."""
+        s, a = transition.s_tm1.flatten(0, 1).numpy(), transition.a_tm1.reshape(-1).numpy()
+        wanted = targets.numpy()
+        for part in parts:
+            picked = wanted[part]
+            errors = self._descent.step_arrays(s[part], a[part], picked, None, annealed)
+            if self._average is not None:
+                self._average.follow()
+        return torch.from_numpy(errors), torch.from_numpy(picked)
 
     def played(self) -> Tensor:
         """The parameters for greedy play: the average where one is kept, else those that are learned."""

@@ -6,15 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuralq.checks import check_positive
 from neuralq.optim import FlatOptimiser, Optimiser, clip_norm_
-from neuralq.q.engine import Engine
+from neuralq.q.engine import Engine, on_arrays
 from neuralq.types import Metrics, Transition
 
 __all__ = ["Descent", "Learner", "Update"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,9 @@ class Learner(Protocol):
 class Descent:
     """Clipped steps of an optimiser along the engine's gradient, with the learning rate annealed linearly if asked.
 
+    ``on_arrays`` is the engine where it computes from arrays to arrays: at an update per environment step, making
+    tensors of them would cost as much as the arithmetic.
+
     Args:
         engine: whose flat vector is changed.
         optimiser: which optimiser.
@@ -84,6 +90,7 @@ class Descent:
         self.learning_rate = learning_rate
         self.max_grad_norm = max_grad_norm
         self._state = FlatOptimiser(optimiser, engine.flat.values)
+        self.on_arrays = on_arrays(engine)
 
     def step(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, scale: float = 1.0) -> Tensor:
         """One step on the weighted loss; returns the errors before it, ``[B]``."""
@@ -91,9 +98,17 @@ class Descent:
         self.follow(scale)
         return errors
 
+    def step_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None, scale: float = 1.0) -> _Array:
+        """As `step`, with arrays ``[B]``, where `on_arrays` is not None."""
+        assert self.on_arrays is not None
+        errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)
+        self.follow(scale)
+        return errors
+
     def follow(self, scale: float = 1.0) -> None:
         """One step along the gradient that lies in the engine's flat vector, wherever it came from."""
-        grad = self.engine.flat.grad
+        flat = self.engine.flat
+        grad = flat.grad if flat.grad_array is None else flat.grad_array
         if self.max_grad_norm is not None:
             clip_norm_(grad, self.max_grad_norm)
         self._state.step(grad, self.learning_rate * scale)

@@ -6,6 +6,7 @@ moves along with the one it was meant for, and that is what decides whether trai
 """
 
 from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
+from neuralq.q.custom import Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
 from neuralq.q.exact_case import LinearQ, TableQ
@@ -18,8 +19,10 @@ __all__ = [
     "NAMED_BODIES",
     "ActionInputQ",
     "ActionOutputQ",
+    "Body",
     "CategoricalQ",
     "Conv",
+    "Custom",
     "DuelingQ",
     "FlatParameters",
     "LinearQ",

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_whole
-from neuralq.q.bodies import ACTIVATIONS, MLP, Conv, GroupedLayerNorm
+from neuralq.q.bodies import ACTIVATIONS, MLP, GroupedLayerNorm
+from neuralq.q.custom import Body
 from neuralq.q.layouts import ActionOutputQ
 
 __all__ = ["DuelingQ"]
@@ -33,7 +34,7 @@ class DuelingQ(nn.Module):
     Args:
         input_shape: shape of one observation (after ``features``, if given).
         num_actions: A.
-        body: `MLP` or `Conv` with at least one hidden layer.
+        body: `MLP`, `Conv` or `Custom` with at least one hidden layer.
         features: module without parameters applied to the observation first.
         rng: generator, or its seed, for the initial weights.
         dtype: float32 by default.
@@ -55,7 +56,7 @@ class DuelingQ(nn.Module):
         self,
         input_shape: tuple[int, ...],
         num_actions: int,
-        body: MLP | Conv | None = None,
+        body: Body | None = None,
         features: nn.Module | None = None,
         rng: np.random.Generator | int = 0,
         dtype: torch.dtype = torch.float32,
@@ -91,7 +92,7 @@ class DuelingQ(nn.Module):
             x = self.shared(x)
             x = ACTIVATIONS[self.activation](x if self.norm is None else self.norm(x))
         value: Tensor = self.value(x)[0]
-        advantage: Tensor = self.advantage(x)[0].reshape(len(value), *self._advantages)
+        advantage: Tensor = self.advantage(x)[0].reshape(value.shape[0], *self._advantages)
         q = value[:, None, :] + advantage - advantage.mean(1, keepdim=True)
         return q.reshape(*leading, self.num_actions)
 

@@ -8,6 +8,7 @@ no difference but speed: both are held to each other by tests.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -24,7 +25,9 @@ from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
 from neuralq.types import QFunction
 
-__all__ = ["Engine", "Loss", "MlpEngine", "TorchEngine", "make_engine", "runs_compiled"]
+__all__ = ["Engine", "Loss", "MlpEngine", "TorchEngine", "array_values", "make_engine", "on_arrays", "runs_compiled"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True)
@@ -202,13 +205,17 @@ class MlpEngine:
         self._activation = list(ACTIVATIONS).index(net.trunk.activation)
         self._loss = kernels.HUBER if loss.kind == "huber" else kernels.SQUARED
         self._delta = loss.delta
-        self._plain_input = self._mask is None and net.input.features is None
+        self.plain_input = self._mask is None and net.input.features is None
         self._dtype: torch.dtype = self.flat.values.dtype
         self._plan, self._starts = _plan_of(net, self.flat)
         self._width: int = net.input.num_features
         self._values = self.flat.values.numpy()
         self._grad = self.flat.grad.numpy()
         self._target: Tensor | None = None
+        self._target_values: Any = None
+        self._kind = self._values.dtype
+        widest, largest = int(self._plan[:, :2].max()), int((self._plan[:, 0] * self._plan[:, 1]).max())
+        self._spare = torch.zeros(2 * max(widest, largest), dtype=self._dtype).numpy()
         self._capacity = 0
         self._reserve(1)
 
@@ -229,7 +236,7 @@ class MlpEngine:
         self._ones = torch.ones(rows, dtype=self._dtype).numpy()
 
     def _rows(self, s: Tensor) -> tuple[Any, tuple[int, ...]]:
-        if self._plain_input:
+        if self.plain_input:
             shape = self._net.input.input_shape
             cut = s.dim() - len(shape)
             leading = tuple(s.shape[:cut])
@@ -245,30 +252,43 @@ class MlpEngine:
         self._reserve(rows.shape[0])
         return np.ascontiguousarray(rows), leading
 
+    def _array_rows(self, s: _Array) -> _Array:
+        """Observations ``[B, *obs]`` as rows; refuses what `_rows` would, the usual kind first."""
+        if s.ndim != 2 or s.dtype != self._kind or s.shape[1] != self._width or not s.flags.carray:
+            return cast(_Array, self._rows(torch.from_numpy(s if s.flags.writeable else s.copy()))[0])
+        if len(s) > self._capacity:
+            self._reserve(len(s))
+        return s
+
     def all(self, s: Tensor, target: bool = False) -> Tensor:
         """Action values without gradient, of the target copy if asked for."""
-        if target and self._target is None:
-            raise _no_target()
         x, leading = self._rows(s)
-        out = np.empty((x.shape[0], self._num_actions), x.dtype)
-        values = cast(Tensor, self._target).numpy() if target else self._values
+        q = torch.from_numpy(self._all(x, target)).view(*leading, self._num_actions)
+        return q if self._mask is None else q.masked_fill_(self._mask.illegal(s), -torch.inf)
+
+    def all_arrays(self, s: _Array, target: bool = False) -> _Array:
+        """As `all`, from observations ``[B, *obs]`` to values ``[B, A]``; for networks with a plain input."""
+        return self._all(self._array_rows(s), target)
+
+    def _all(self, x: _Array, target: bool) -> _Array:
+        values = self._target_values if target else self._values
+        if values is None:
+            raise _no_target()
+        out = np.empty((len(x), self._num_actions), self._kind)
         kernels.all_values(
             values, self._plan, self._starts, self._layout, self._num_actions, self._activation, x,
             self._acts, self._hats, self._inverse, self._pairs, out,
         )  # fmt: skip
-        q = torch.from_numpy(out).view(*leading, self._num_actions)
-        return q if self._mask is None else q.masked_fill_(self._mask.illegal(s), -torch.inf)
+        return out
 
-    def _pull(self, s: Tensor, a: Tensor, target: Any, weight: Any, loss: int) -> Any:
-        x, _ = self._rows(s)
-        actions = a.reshape(-1).numpy()
-        if actions.size != x.shape[0]:
-            raise ValueError(f"got {x.shape[0]} states and {actions.size} actions; they must pair up")
-        q = np.empty(x.shape[0], x.dtype)
+    def _pull(self, x: _Array, actions: _Array, target: Any, weight: Any, loss: int) -> Any:
+        if actions.size != len(x):
+            raise ValueError(f"got {len(x)} states and {actions.size} actions; they must pair up")
+        q = np.empty(len(x), self._kind)
         wrong = kernels.pull(
             self._values, self._grad, self._plan, self._starts, self._layout, self._num_actions, self._activation,
-            x, actions, q if target is None else target, self._ones[: x.shape[0]] if weight is None else weight,
-            loss, self._delta, self._acts, self._hats, self._inverse, self._deltas, self._pairs, q,
+            x, actions, q if target is None else target, self._ones[: len(x)] if weight is None else weight,
+            loss, self._delta, self._acts, self._hats, self._inverse, self._deltas, self._pairs, self._spare, q,
         )  # fmt: skip
         if wrong >= 0:
             raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions[wrong]}")
@@ -280,13 +300,20 @@ class MlpEngine:
         self._check_legal(s, a, weight)
         wanted = target.to(self._dtype).reshape(-1).numpy()
         weights = None if weight is None else weight.to(self._dtype).reshape(-1).numpy()
-        return torch.from_numpy(wanted - self._pull(s, a, wanted, weights, self._loss)).view(a.shape)
+        q = self._pull(self._rows(s)[0], a.reshape(-1).numpy(), wanted, weights, self._loss)
+        return torch.from_numpy(wanted - q).view(a.shape)
+
+    def loss_gradient_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None = None) -> _Array:
+        """As `loss_gradient` for ``[B]`` samples in arrays, target and weight in the network's precision."""
+        if not len(a) == len(target) == (len(a) if weight is None else len(weight)):
+            raise ValueError(f"actions, targets and weights must pair up; got {len(a)} and {len(target)} of them")
+        return cast(_Array, target - self._pull(self._array_rows(s), a, target, weight, self._loss))
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
         _check_single(a)
         self._check_legal(s, a)
-        return torch.from_numpy(self._pull(s, a, None, None, kernels.VALUE))[0]
+        return torch.from_numpy(self._pull(self._rows(s)[0], a.reshape(-1).numpy(), None, None, kernels.VALUE))[0]
 
     def _check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
         if self._mask is not None:
@@ -297,6 +324,7 @@ class MlpEngine:
         """Copy the parameters into the target copy."""
         if self._target is None:
             self._target = torch.empty_like(self.flat.values)
+            self._target_values = self._target.numpy()
         self._target.copy_(self.flat.values)
 
     def target_values(self) -> Tensor | None:
@@ -324,6 +352,31 @@ def _plan_of(net: Any, flat: FlatParameters) -> tuple[Any, Any]:
     table = np.array(plan, dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(table[:-1, 1])]).astype(np.int64)
     return table, starts
+
+
+def on_arrays(engine: Engine) -> MlpEngine | None:
+    """The engine if it also computes from arrays to arrays: compiled, on observations that go in as they are.
+
+    Example:
+        >>> from neuralq.q import MLP, ActionOutputQ, TableQ
+        >>> on_arrays(make_engine(TableQ(2, 2), Loss())) is None
+        True
+        >>> on_arrays(make_engine(ActionOutputQ((4,), 2, MLP((8,))), Loss())).all_arrays(np.zeros((3, 4), "f")).shape
+        (3, 2)
+    """
+    return engine if isinstance(engine, MlpEngine) and engine.plain_input else None
+
+
+def array_values(engine: Engine) -> Callable[[_Array], _Array] | None:
+    """Observations ``[B, *obs]`` to action values ``[B, A]`` without tensors, where the engine can.
+
+    Example:
+        >>> from neuralq.q import MLP, ActionOutputQ
+        >>> array_values(make_engine(ActionOutputQ((4,), 2, MLP((8,))), Loss()))(np.zeros((3, 4), np.float32)).shape
+        (3, 2)
+    """
+    arrays = on_arrays(engine)
+    return None if arrays is None else arrays.all_arrays
 
 
 def make_engine(q: QFunction, loss: Loss, kind: str = "auto") -> Engine:

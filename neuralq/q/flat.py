@@ -16,6 +16,8 @@ class FlatParameters:
     Optimisers, traces, target copies, step bounds and checkpoints are then expressions on one vector. Autograd
     accumulates into the same memory, because it adds in place to a gradient that is already there.
 
+    ``grad_array`` is the memory of ``grad`` as an array, None on other devices than the CPU.
+
     Args:
         module: its parameters (in the order of ``module.parameters()``) are moved; they must share dtype and device.
 
@@ -39,6 +41,8 @@ class FlatParameters:
         total = sum(p.numel() for p in parameters)
         self.values = torch.empty(total, dtype=first.dtype, device=first.device)
         self.grad = torch.zeros_like(self.values)
+        on_cpu = first.device.type == "cpu"
+        self.grad_array = self.grad.numpy() if on_cpu else None
         start = 0
         for p in parameters:
             end = start + p.numel()

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_whole
-from neuralq.q.bodies import MLP, Conv
+from neuralq.q.bodies import MLP
+from neuralq.q.custom import Body
 
 __all__ = ["ActionInputQ", "ActionOutputQ", "SeparateQ"]
 
@@ -25,7 +26,7 @@ class _Input(nn.Module):
     def __init__(
         self,
         input_shape: tuple[int, ...],
-        body: MLP | Conv,
+        body: Body,
         copies: int,
         features: nn.Module | None,
         rng: np.random.Generator,
@@ -66,7 +67,7 @@ class ActionOutputQ(nn.Module):
     Args:
         input_shape: shape of one observation (after ``features``, if given).
         num_actions: A.
-        body: `MLP` or `Conv`.
+        body: `MLP`, `Conv`, or a module of your own (`Custom`).
         features: module without parameters applied to the observation first (one-hot, pixel scaling).
         rng: generator, or its seed, for the initial weights.
         dtype: float32 by default.
@@ -81,7 +82,7 @@ class ActionOutputQ(nn.Module):
         self,
         input_shape: tuple[int, ...],
         num_actions: int,
-        body: MLP | Conv | None = None,
+        body: Body | None = None,
         features: nn.Module | None = None,
         rng: np.random.Generator | int = 0,
         dtype: torch.dtype = torch.float32,
@@ -119,7 +120,7 @@ class SeparateQ(nn.Module):
         self,
         input_shape: tuple[int, ...],
         num_actions: int,
-        body: MLP | Conv | None = None,
+        body: Body | None = None,
         features: nn.Module | None = None,
         rng: np.random.Generator | int = 0,
         dtype: torch.dtype = torch.float32,
@@ -145,7 +146,8 @@ class SeparateQ(nn.Module):
 class ActionInputQ(nn.Module):
     """State and one-hot action in, one value out: Mitchell's first layout.
 
-    Arguments as for `ActionOutputQ`. With a `Conv` body the action joins after the convolutions.
+    Arguments as for `ActionOutputQ`. With a `Conv` body the action joins after the convolutions, with a
+    `Custom` one after the module, whose ``hidden`` must not be empty.
 
     Example:
         >>> q = ActionInputQ((4,), num_actions=2, body=MLP(hidden=(8,)), rng=0)
@@ -157,7 +159,7 @@ class ActionInputQ(nn.Module):
         self,
         input_shape: tuple[int, ...],
         num_actions: int,
-        body: MLP | Conv | None = None,
+        body: Body | None = None,
         features: nn.Module | None = None,
         rng: np.random.Generator | int = 0,
         dtype: torch.dtype = torch.float32,

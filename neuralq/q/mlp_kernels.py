@@ -22,6 +22,7 @@ import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (np.dot in kernels uses it; loaded here, thread limits set later reach it)
 
 from neuralq.jit import reassociating_kernel
+from neuralq.q.products import multiply, suits
 
 __all__ = ["ACTION_INPUT", "ACTION_OUTPUT", "HUBER", "SEPARATE", "SQUARED", "VALUE", "all_values", "pull"]
 
@@ -86,26 +87,26 @@ def _forward(
 ) -> _Array:
     rows = x.shape[0]
     num_layers = plan.shape[0]
-    h = x
+    h, h_at = x.reshape(-1), 0
     for layer in range(num_layers):
         fan_in, fan_out = plan[layer, 0], plan[layer, 1]
-        at = plan[layer, 2] + copy * fan_in * fan_out
-        weight = params[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
-        at = plan[layer, 3] + copy * fan_out
-        bias = params[at : at + fan_out]
+        weight_at = plan[layer, 2] + copy * fan_in * fan_out
+        bias_at = plan[layer, 3] + copy * fan_out
         block = rows * starts[layer]
         y = acts[block : block + rows * fan_out].reshape(rows, fan_out)
-        np.dot(h, weight, y)
         last = layer == num_layers - 1
-        if last or activation != 0 or plan[layer, 4] != -1:
-            for i in range(rows):
-                for j in range(fan_out):
-                    y[i, j] += bias[j]
+        if suits(fan_in, fan_out):
+            multiply(h, h_at, fan_in, 1, rows, fan_in, params, weight_at, fan_out, params, bias_at, acts, block)
         else:
+            weight = params[weight_at : weight_at + fan_in * fan_out].reshape(fan_in, fan_out)
+            np.dot(h[h_at : h_at + rows * fan_in].reshape(rows, fan_in), weight, y)
             for i in range(rows):
                 for j in range(fan_out):
-                    v = y[i, j] + bias[j]
-                    y[i, j] = params.dtype.type(0) if v <= 0 else v  # NaN stays
+                    y[i, j] += params[bias_at + j]
+        if not last and activation == 0 and plan[layer, 4] == -1:
+            for i in range(rows):
+                for j in range(fan_out):
+                    y[i, j] = params.dtype.type(0) if y[i, j] <= 0 else y[i, j]  # NaN stays
         if not last:
             if plan[layer, 4] != -1:
                 width = fan_out if plan[layer, 4] >= 0 else 0  # of scale and shift
@@ -119,8 +120,8 @@ def _forward(
                 for i in range(rows):
                     for j in range(fan_out):
                         y[i, j] = _activate(y[i, j], activation)
-        h = y
-    return h
+        h, h_at = acts, block
+    return y
 
 
 @reassociating_kernel
@@ -176,9 +177,14 @@ def _backward(
     hats: _Array,
     inverse: _Array,
     deltas: _Array,
+    spare: _Array,
 ) -> None:
-    """Gradient of Σ outputs·(their block of ``deltas``), written over ``grads`` of this copy."""
+    """Gradient of Σ outputs·(their block of ``deltas``), written over ``grads`` of this copy.
+
+    ``spare`` begins with as many zeros as the widest layer has inputs or outputs; the rest is overwritten.
+    """
     rows = x.shape[0]
+    zeros = spare.size // 2
     num_layers = plan.shape[0]
     for layer in range(num_layers - 1, -1, -1):
         fan_in, fan_out = plan[layer, 0], plan[layer, 1]
@@ -201,16 +207,23 @@ def _backward(
             for j in range(fan_out):
                 grad_bias[j] += d[i, j]
         at = plan[layer, 2] + copy * fan_in * fan_out
-        grad_weight = grads[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
-        h = x
+        h, h_at = x.reshape(-1), 0
         if layer > 0:
-            below = rows * starts[layer - 1]
-            h = acts[below : below + rows * fan_in].reshape(rows, fan_in)
-        np.dot(h.T, d, grad_weight)
+            h, h_at = acts, rows * starts[layer - 1]
+        if suits(rows, fan_out):
+            multiply(h, h_at, 1, fan_in, fan_in, rows, deltas, block, fan_out, spare, 0, grads, at)
+        else:
+            grad_weight = grads[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
+            np.dot(h[h_at : h_at + rows * fan_in].reshape(rows, fan_in).T, d, grad_weight)
         if layer > 0:
-            weight = params[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
-            below = rows * starts[layer - 1]
-            np.dot(d, weight.T, deltas[below : below + rows * fan_in].reshape(rows, fan_in))
+            if suits(fan_out, fan_in):
+                for j in range(fan_out):
+                    for i in range(fan_in):
+                        spare[zeros + j * fan_in + i] = params[at + i * fan_out + j]
+                multiply(deltas, block, fan_out, 1, rows, fan_out, spare, zeros, fan_in, spare, 0, deltas, h_at)
+            else:
+                weight = params[at : at + fan_in * fan_out].reshape(fan_in, fan_out)
+                np.dot(d, weight.T, deltas[h_at : h_at + rows * fan_in].reshape(rows, fan_in))
 
 
 @reassociating_kernel
@@ -290,6 +303,7 @@ def pull(
     inverse: _Array,
     deltas: _Array,
     pairs: _Array,
+    spare: _Array,
     q_out: _Array,
 ) -> int:
     """Write the loss's gradient over ``grads`` and Q(s, a) ``[B]`` into ``q_out``.
@@ -303,6 +317,8 @@ def pull(
             return i
     for i in range(grads.size):
         grads[i] = 0
+    if rows == 0:
+        return -1
     top = starts[plan.shape[0] - 1]
     outputs = num_actions if layout == ACTION_OUTPUT else 1
     inputs = x
@@ -334,5 +350,5 @@ def pull(
             q_out[i] = q[row, c]
             slope[row, c] = _slope(q[row, c], target[i], weight[i], loss, delta, rows)
             row += 1
-        _backward(params, grads, plan, starts, copy, activation, inputs, acts, hats, inverse, deltas)
+        _backward(params, grads, plan, starts, copy, activation, inputs, acts, hats, inverse, deltas, spare)
     return -1
