@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 import secrets
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, TextIO, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from neuralq.report import MissingExtra
 
-__all__ = ["ProgressBar", "TensorBoard", "WeightsAndBiases"]
+__all__ = ["ProgressBar", "TensorBoard", "WeightsAndBiases", "own_hook"]
 
 _QUIET_SECONDS = 10.0
 """Where the output is no terminal: one line at most this often."""
@@ -28,6 +29,7 @@ class ProgressBar:
         total_steps: the run's budget.
         target: greedy return at which it stops, shown beside the returns.
         stream: where to draw; standard error by default, so that standard output stays clean.
+        epsilon: exploration at a number of steps, shown beside the rest.
 
     Example:
         >>> import io
@@ -35,7 +37,14 @@ class ProgressBar:
         ...     bar({"kind": "train", "env_steps": 50, "steps_per_second": 10.0, "episode_return": None})
     """
 
-    def __init__(self, total_steps: int, target: float | None = None, stream: TextIO | None = None) -> None:
+    def __init__(
+        self,
+        total_steps: int,
+        target: float | None = None,
+        stream: TextIO | None = None,
+        epsilon: Callable[[int], float] | None = None,
+    ) -> None:
+        self._epsilon = epsilon
         self._console = Console(file=stream or sys.stderr)
         self._target = target
         self._latest: dict[str, Any] = {}
@@ -64,7 +73,10 @@ class ProgressBar:
         """Take in a row of metrics."""
         self._latest.update({k: v for k, v in row.items() if v is not None})
         latest = self._latest
-        parts = []
+        parts = [] if self._epsilon is None else [f"ε {self._epsilon(int(row['env_steps'])):.3g}"]
+        for name, shown in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
+            if name in latest:
+                parts.append(f"{shown} {latest[name]:.3g}")
         if "episode_return" in latest:
             parts.append(f"return {latest['episode_return']:.1f}")
         if "greedy_return" in latest:
@@ -107,6 +119,32 @@ class TensorBoard:
         self._writer.close()
 
 
+def own_hook(name: str) -> Callable[[Mapping[str, Any]], None]:
+    """A hook of the user's own: a function that takes a row of metrics, or a class whose instances do.
+
+    Args:
+        name: "package.module:name", imported as environments and bodies of one's own are.
+
+    Raises:
+        ValueError: if there is nothing of that name, or it cannot be called.
+
+    Example:
+        >>> own_hook("builtins:print")({"kind": "train", "env_steps": 64})
+        {'kind': 'train', 'env_steps': 64}
+    """
+    place, _, attribute = name.partition(":")
+    try:
+        found: Any = importlib.import_module(place) if attribute else None
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"cannot import the hook {name!r}: {error}; name it as 'module:function'") from error
+    hook = found() if isinstance(found, type) else found
+    if not callable(hook):
+        raise ValueError(f"the hook {name!r} must take a row of metrics when called, got {hook!r}")
+    return cast(Callable[[Mapping[str, Any]], None], hook)
+
+
 class WeightsAndBiases:
     """Logs every number of every row to Weights & Biases; ``WANDB_MODE=offline`` keeps it on this machine.
 
@@ -119,6 +157,7 @@ class WeightsAndBiases:
 
     Raises:
         MissingExtra: if the package is not installed.
+        ValueError: if it cannot begin a record, as without a login.
     """
 
     def __init__(self, run_dir: str | Path, config: Mapping[str, Any], project: str = "neuralq") -> None:
@@ -133,9 +172,16 @@ class WeightsAndBiases:
         if not kept.exists():
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_text(secrets.token_hex(8))
-        self._run: Any = wandb.init(
-            project=project, name=folder.name, id=kept.read_text(), resume="allow", dir=str(folder), config=dict(config)
-        )
+        try:
+            self._run: Any = wandb.init(
+                project=project, name=folder.name, id=kept.read_text(), resume="allow", dir=str(folder),
+                config=dict(config),
+            )  # fmt: skip
+        except Exception as error:  # of the package's own kinds: not logged in, no network, …
+            raise ValueError(
+                f"Weights & Biases cannot keep a record: {str(error).rstrip('.')}; log in with: wandb login, or set "
+                "WANDB_MODE=offline to keep it on this machine"
+            ) from error
         # Steps are a column of their own: the package drops rows that go back in its own count, as a resumed run does.
         self._run.define_metric("*", step_metric="env_steps")
 

@@ -127,6 +127,20 @@ def test_the_table_and_its_json(tmp_path: Path, capsys: Capture) -> None:
     assert groups[1]["low"] is None and groups[1]["greedy_returns"] == [12.25]
 
 
+def test_many_settings_stand_below_the_table(tmp_path: Path, capsys: Capture) -> None:
+    wide = {f"setting_{number}": 0.5 for number in range(30)}
+    paths = [
+        write_run(tmp_path / "a", 0, {10: 1.0}, streaming=wide),
+        write_run(tmp_path / "b", 0, {10: 2.0}, gradient={}),
+    ]
+    assert main(["compare", *map(str, paths)]) == 0
+    header, first, second, *below = capsys.readouterr().out.splitlines()
+    assert header.split() == "run seeds greedy return 95 % interval mean steps CPU s".split()
+    assert first.split()[:3] == ["a", "1", "1.0"] and second.split()[:3] == ["b", "1", "2.0"]
+    assert len(below) == 2 and below[0].startswith("a: streaming.setting_0 0.5, ") and below[1].startswith("b: ")
+    assert "setting" not in below[1], "what a run does not have is not listed for it"
+
+
 @pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_the_plot(suffix: str, tmp_path: Path, capsys: Capture) -> None:
     pytest.importorskip("matplotlib")

@@ -94,6 +94,18 @@ def test_the_file_gives_the_runs_values(
         assert np.array_equal(np.isfinite(values[0]), np.asarray(mask) != 0)
 
 
+def test_dueling_streams_of_a_distribution(tmp_path: Path, capsys: Capture) -> None:
+    """They are reshaped twice, and neither may remember the batch that was traced."""
+    words = ["--preset", "false", "--total-steps", "40", "--learner", "replay", "--replay.learning-starts", "20"]
+    words += ["--replay.distribution", "quantile", "--replay.num-atoms", "5", "--dueling", "true", "--hidden", "8"]
+    words += ["--evaluation-episodes", "1", "--run-dir", str(tmp_path / "run")]
+    assert main(["train", "CartPole-v1", *words]) == 0
+    capsys.readouterr()
+    assert main(["export", str(tmp_path / "run"), "--onnx", str(tmp_path / "policy.onnx"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["max_abs_difference"] <= result["allowed"]
+
+
 def test_a_file_that_differs_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     run, file = trained(tmp_path / "run", "CartPole-v1"), tmp_path / "policy.onnx"
     played = export_module._played

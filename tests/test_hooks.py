@@ -1,7 +1,8 @@
 """Hooks show what happens and change nothing.
 
 Mutants that must die here: a line for every row where nobody watches · no line at all · returns forgotten between rows
-· a target that is not shown · numbers written at another step · a hook that changes the run.
+· a target that is not shown · numbers written at another step · a hook that changes the run · a hook
+of the user's own that is not called, or not closed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import Any
 import pytest
 
 from neuralq import hooks
-from neuralq.hooks import ProgressBar, TensorBoard
+from neuralq.cli import main
+from neuralq.hooks import ProgressBar, TensorBoard, own_hook
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
 from neuralq.recipes import RunConfig, train
@@ -49,6 +51,51 @@ def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytes
         "1,100 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
         "2,200 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
     ]
+
+
+def test_exploration_error_and_the_largest_value_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(hooks, "time", clock)
+    with ProgressBar(100, stream=stream, epsilon=lambda steps: 1 - steps / 100) as bar:
+        clock.now = 11.0
+        bar(row(25, abs_td_error=0.12345, max_q=8.0))
+    assert stream.getvalue() == "25 steps · 1,234 steps/s · ε 0.75 · |δ| 0.123 · max Q 8 · return 20.2\n"
+
+
+OWN = """
+seen = []
+def note(row):
+    seen.append(dict(row))
+class Closing:
+    closed = 0
+    def __call__(self, row):
+        seen.append(row["kind"])
+    def close(self):
+        Closing.closed += 1
+number = 3
+"""
+
+
+def test_a_hook_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own_hooks.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    words = ["--preset", "false", "--rollout.num-envs", "2", "--rollout.num-steps", "16", "--hidden", "4"]
+    words += ["--evaluation-episodes", "1", "--total-steps", "64", "--log-every", "32"]
+    path = str(tmp_path / "run")
+    assert main(["train", "CartPole-v1", *words, "--run-dir", path, "--hook", "own_hooks:note"]) == 0
+    module = sys.modules.pop("own_hooks")
+    assert module.seen == read_metrics(path)
+    assert main(["resume", path, "--total-steps", "128", "--hook", "own_hooks:Closing"]) == 0
+    module = sys.modules.pop("own_hooks")
+    assert "train" in module.seen and module.Closing.closed == 1
+    for name, said in (("own_hooks:nobody", "cannot import the hook"), ("nowhere", "name it as 'module:function'")):
+        assert main(["resume", path, "--total-steps", "256", "--hook", name]) == 1
+        assert said in capsys.readouterr().err
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="must take a row of metrics when called, got 3"):
+        own_hook("own_hooks:number")
 
 
 def test_a_row_without_returns_keeps_the_last_ones(monkeypatch: pytest.MonkeyPatch) -> None:

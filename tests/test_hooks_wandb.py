@@ -1,4 +1,4 @@
-"""Weights & Biases, told by a module that only notes what it is asked.
+"""Weights & Biases, told by a module that only notes what it is asked, and by the package itself where there is one.
 
 Mutants that must die here: the record's id not kept for the resumed run · texts and lists logged as numbers · steps
 left out · the record not ended · the command that does not log.
@@ -74,6 +74,35 @@ def test_a_run_and_its_continuation_are_one_record(tmp_path: Path, records: list
     assert first.is_finished and second.is_finished
     assert max(row["env_steps"] for row in first.logged) < min(row["env_steps"] for row in second.logged)
     assert any("evaluation/greedy_return" in row for row in second.logged)
+
+
+def test_what_the_package_refuses_is_one_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class UsageError(Exception):
+        """As the package raises without a login: no error of Python's own."""
+
+    def init(**asked: Any) -> Record:
+        raise UsageError("No API key configured. Use `wandb login` to log in.")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    assert main(["train", "CartPole-v1", "--wandb", "--run-dir", str(tmp_path / "run")]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert "No API key configured" in said[-1] and "WANDB_MODE=offline" in said[-1] and "Traceback" not in "".join(said)
+
+
+@pytest.mark.slow
+def test_the_package_itself_keeps_a_record_on_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb", reason="needs the extra wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    for _ in range(2):  # begun, and gone on with
+        tracker = WeightsAndBiases(tmp_path, {"seed": 3})
+        tracker({"kind": "train", "env_steps": 64, "loss": 0.5, "episode_return": None})
+        tracker.close()
+    name = (tmp_path / "wandb" / "neuralq-run-id").read_text()
+    kept = list((tmp_path / "wandb").glob(f"offline-run-*/run-{name}.wandb"))
+    assert kept and all(b"train/loss" in file.read_bytes() for file in kept)
 
 
 def test_a_missing_package_is_one_error(

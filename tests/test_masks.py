@@ -24,7 +24,7 @@ from neuralq.acting import choose_epsilon_greedy, choose_greedy
 from neuralq.agent import Agent
 from neuralq.evaluation import evaluate_greedy
 from neuralq.interact import Interaction, Lane, legal_actions, make_vector_env
-from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
 from neuralq.q import MLP, MaskedQ
 from neuralq.recipes import RunConfig, build
 from neuralq.recipes.build import build_session
@@ -110,11 +110,13 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "streaming": {"streaming": StreamingSettings(scale_rewards=False)},
     "streaming published": {"streaming": StreamingSettings(scale_rewards=False, cut="published")},
     "streaming intentional": {"streaming": StreamingSettings(scale_rewards=False, bound="intentional")},
+    "qrc": {"gradient": GradientSettings(step_size=0.05, scale_rewards=False)},
+    "gq": {"gradient": GradientSettings(method="gq", step_size=0.05, scale_rewards=False)},
 }
 CASES = [
     *((name, "linear") for name in LEARNERS),
-    *((name, "table") for name in ("rollout peng", "dqn", "quantile", "online", "streaming")),
-    *((name, "action-output") for name in ("rollout watkins", "dqn", "double", "online", "streaming")),
+    *((name, "table") for name in ("rollout peng", "dqn", "quantile", "online", "streaming", "qrc")),
+    *((name, "action-output") for name in ("rollout watkins", "dqn", "double", "online", "streaming", "qrc")),
 ]
 BOUND = 15.0  # no return exceeds 5, and the control shows what seeing the illegal action does
 STEPS = 240

@@ -1,12 +1,14 @@
 """Configurations refuse contradictions and survive being stored; recipes build what they say.
 
 Mutants that must die here: a value of the wrong kind let through · a list not turned back into a tuple · settings of
-the wrong learner ignored · an environment of one's own not imported · a preset's value winning over a given one.
+the wrong learner ignored · an environment of one's own not imported · a missing engine left to the environment's
+constructor · a preset's value winning over a given one.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +53,7 @@ def test_a_configuration_comes_back_from_json_as_it_was(config: RunConfig) -> No
         ({"rollout": {"num_envs": "x"}}, "rollout.num_envs must be a whole number, got 'x'"),
         ({"rollout": [4]}, "rollout must be a mapping, got"),
         ({"rollout": {"lamda": 1}}, "rollout has unknown keys lamda; known are"),
-        ({"body": {"hidden": [8]}}, "class of the body must be one of 'MLP', 'Conv', got None"),
+        ({"body": {"hidden": [8]}}, "class of the body must be one of 'MLP', 'Conv', 'Custom', got None"),
         ({"body": {"class": "RNN"}}, "class of the body must be one of"),
         ({"body": {"class": "MLP", "depth": 2}}, "body has unknown keys depth"),
         ({"body": "MLP"}, "body must be a mapping with a class"),
@@ -155,6 +157,22 @@ def test_an_environment_that_raises_when_it_is_made_is_named(tmp_path: Path, mon
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match="'sad_games:Game-v0': RuntimeError: no display"):
         make_envs(RunConfig(env="sad_games:Game-v0"), 2)
+
+
+@pytest.mark.parametrize("env", ["LunarLander-v3", "BipedalWalker-v3"])
+def test_a_missing_engine_is_one_clear_line(env: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    with pytest.raises(ValueError, match=rf"{env} needs the extra 'box2d' .*: pip install 'neuralq\[box2d\]'$"):
+        make_envs(RunConfig(env=env), 1)
+    make_envs(RunConfig(env="CartPole-v1"), 1).close()
+
+
+def test_the_lander_trains_with_its_preset(tmp_path: Path) -> None:
+    pytest.importorskip("Box2D", reason="needs the extra box2d")
+    config = with_preset({"env": "LunarLander-v3", "total_steps": 64, "evaluation_episodes": 1})
+    assert config.total_steps == 64 and config.learner == "rollout"
+    run = train(config, tmp_path / "run")
+    assert run.env_steps >= 64 and run.greedy_return is not None
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_built() -> None:

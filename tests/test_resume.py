@@ -27,7 +27,7 @@ from gymnasium import spaces
 from neuralq import checkpoint
 from neuralq.cli import main
 from neuralq.interact import EnvironmentFault
-from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
+from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP
 from neuralq.recipes import Run, RunConfig, resume, train
 from neuralq.record import RunFolder, RunFolderBusy, read_config, read_metrics
@@ -97,10 +97,21 @@ CASES = {
     "online, linear": online("linear", trace="dutch"),
     "online, network": online("action-output", trace="replacing") | {"body": SMALL, "total_steps": 300},
     "online, table": online("table", step_size=0.1) | {"env": GRID},
-}
+    "qrc, network": {"learner": "gradient", "gradient": GradientSettings(step_size=1e-3), "body": SMALL},
+    "gq, linear": {
+        "learner": "gradient", "layout": "linear", "gradient": GradientSettings(method="gq", lambda_=0.4, beta=0.5),
+    },
+}  # fmt: skip
 
 
-SLOW = ("rollout, table", "rollout, linear, annealed", "replay, table", "replay, one-step", "online, table")
+SLOW = (
+    "rollout, table",
+    "rollout, linear, annealed",
+    "replay, table",
+    "replay, one-step",
+    "online, table",
+    "gq, linear",
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else []) for name in CASES])

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 __all__ = ["COMMANDS", "Failure", "command_parser", "main", "print_result"]
 
 COMMANDS = {
-    "train": ("neuralq.cli.runs", "train", "train on a Gymnasium environment by TD(λ)"),
+    "train": ("neuralq.cli.runs", "train", "train on a Gymnasium environment, or td-gammon, by TD(λ)"),
     "resume": ("neuralq.cli.runs", "resume", "go on with a run that was stopped or killed"),
     "evaluate": ("neuralq.cli.runs", "evaluate", "play greedy episodes with a trained run"),
     "report": ("neuralq.cli.runs", "report", "write a run's report.html"),
@@ -26,6 +28,7 @@ COMMANDS = {
     "chapter": ("neuralq.cli.chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13"),
     "baird": ("neuralq.cli.demo", "baird", "predict divergence on Baird's star, then measure it"),
     "lab": ("neuralq.cli.lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page"),
+    "play": ("neuralq.cli.play", "play", "play backgammon against a trained agent, or tic-tac-toe, in the browser"),
     "demo": ("neuralq.cli.demo", "demo", "learn CartPole, predict a divergence, write a page about both"),
 }
 
@@ -91,6 +94,19 @@ def _top_parser() -> argparse.ArgumentParser:
     return parser
 
 
+@contextlib.contextmanager
+def _present_folder() -> Iterator[None]:
+    """Environments and bodies of the user's own are found where the command was given, after all that is installed."""
+    here = str(Path.cwd())
+    if added := here not in sys.path:
+        sys.path.append(here)
+    try:
+        yield
+    finally:
+        if added and here in sys.path:
+            sys.path.remove(here)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -102,8 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2  # not reached: argparse has ended the process with help or an error
     module, function, _ = COMMANDS[arguments[0]]
     try:
-        command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
-        with warnings.catch_warnings():
+        with _present_folder(), warnings.catch_warnings():
+            command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
             warnings.showwarning = _show_warning
             return command(arguments[1:])
     except Failure as failure:

@@ -12,12 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from neuralq.cli import Failure, command_parser, print_result
+from neuralq.cli.sweeps import is_td_gammon_run
 from neuralq.report.comparison import Group, comparison_png, comparison_svg, read_groups
 from neuralq.report.page import format_value
 
 __all__ = ["compare"]
 
 _FORMATS = {".svg", ".png"}
+_HEADINGS = ("run", "seeds", "greedy return", "95 % interval", "mean", "steps", "CPU s")
 
 
 def compare(argv: list[str]) -> int:
@@ -35,6 +37,8 @@ def compare(argv: list[str]) -> int:
     out = None if options.out is None else Path(options.out)
     if out is not None and out.suffix.lower() not in _FORMATS:
         raise Failure(f"--out must end in .svg or .png, got {options.out!r}", 2)
+    for path in filter(is_td_gammon_run, options.runs):
+        raise Failure(f"{path} is a TD-Gammon run, which has no returns; neuralq evaluate {path} --against RUN", 2)
     groups, left_out = read_groups(options.runs)
     for reason in left_out:
         print(f"neuralq: left out: {reason}", file=sys.stderr)
@@ -57,30 +61,49 @@ def _draw(groups: Sequence[Group], out: Path) -> None:
 
 def _print(groups: Sequence[Group]) -> None:
     # A pipe has no width of its own: wide enough for the table, so that nothing is cut.
-    width = shutil.get_terminal_size((160, 24)).columns
-    console = Console(highlight=False, width=max(width, 80))
+    width = max(shutil.get_terminal_size((160, 24)).columns, 80)
+    console = Console(highlight=False, width=width)
+    names = list(dict.fromkeys(name for group in groups for name in group.settings))
+    rows = [_numbers(group) for group in groups]
+    settings = [[format_value(group.settings.get(name)) for name in names] for group in groups]
+    beside = _width([[*_HEADINGS, *names], *map(list.__add__, rows, settings)]) <= width
     table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("run", overflow="fold")
-    for heading in ("seeds", "greedy return", "95 % interval", "mean", "steps", "CPU s"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    names = dict.fromkeys(name for group in groups for name in group.settings)
-    for name in names:
+    for heading in _HEADINGS:
+        table.add_column(
+            heading, **({"overflow": "fold"} if heading == "run" else {"justify": "right", "no_wrap": True})
+        )
+    for name in names if beside else ():
         table.add_column(escape(name.rstrip("_")), overflow="fold")
-    for group in groups:
-        found = group.estimate
-        interval = "–" if found.low is None or found.high is None else f"{found.low:.1f} … {found.high:.1f}"
-        own = [format_value(group.settings.get(name)) for name in names]
-        cells = [
-            group.name,
-            str(len(group.runs)),
-            f"{found.iqm:.1f}",
-            interval,
-            f"{sum(group.returns) / len(group.runs):.1f}",
-            _spread([run.env_steps for run in group.runs]),
-            _spread([run.cpu_seconds for run in group.runs]),
-        ]
-        table.add_row(*map(escape, [*cells, *own]))
+    for row, own in zip(rows, settings, strict=True):
+        table.add_row(*map(escape, [*row, *(own if beside else ())]))
     console.print(table)
+    if not beside:  # runs of different learners differ in dozens of settings
+        for group in groups:
+            console.print(escape(f"{group.name}: {_in_words(group)}"), soft_wrap=True)
+
+
+def _numbers(group: Group) -> list[str]:
+    """The cells below `_HEADINGS`."""
+    found = group.estimate
+    return [
+        group.name,
+        str(len(group.runs)),
+        f"{found.iqm:.1f}",
+        "–" if found.low is None or found.high is None else f"{found.low:.1f} … {found.high:.1f}",
+        f"{sum(group.returns) / len(group.runs):.1f}",
+        _spread([run.env_steps for run in group.runs]),
+        _spread([run.cpu_seconds for run in group.runs]),
+    ]
+
+
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Characters that a table with these rows takes."""
+    return sum(max(map(len, column)) + 2 for column in zip(*rows, strict=True))
+
+
+def _in_words(group: Group) -> str:
+    own = {name: value for name, value in group.settings.items() if value is not None}
+    return ", ".join(f"{name.rstrip('_')} {format_value(value)}" for name, value in own.items())
 
 
 def _spread(values: Sequence[float]) -> str:

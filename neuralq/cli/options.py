@@ -17,6 +17,7 @@ from jsonargparse import ArgumentParser
 from neuralq.cli import Failure
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.recipes import RunConfig, preset_for
+from neuralq.recipes.budget import cut_to_budget
 from neuralq.recipes.config import LAYOUTS, LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
 
 __all__ = ["TrainOptions", "hyphenated", "parse_train"]
@@ -26,6 +27,7 @@ _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seeds 10
   neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
   neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
+  neuralq train td-gammon --games 100000  (backgammon; has options of its own)
   neuralq train my_package:MyEnv-v0 --rollout.lambda 0.8 --hidden 64,64
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
@@ -42,19 +44,23 @@ class TrainOptions:
         run_dir: folder for the run, or None for one of its own.
         tensorboard: whether to write event files.
         wandb: whether to log to Weights & Biases.
+        hook: a hook of the user's own as "module:name", or None.
         seeds: how many seeds to run side by side, or None for one run.
         workers: how many of them at a time, or None for as many as there are cores.
         json: whether to print the result as JSON.
         preset: whether a preset gave defaults.
+        notes: what was made of schedules that the budget would not have let finish.
     """
 
     run_dir: str | None
     tensorboard: bool
     wandb: bool
+    hook: str | None
     seeds: int | None
     workers: int | None
     json: bool
     preset: bool
+    notes: tuple[str, ...]
 
 
 def hyphenated(argv: Sequence[str]) -> list[str]:
@@ -167,7 +173,7 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
 
 def _field_help(settings: type) -> dict[str, str]:
     """What each field of a dataclass is for, read from its docstring, so that it is written once."""
-    block = (settings.__doc__ or "").split("Args:")[1]
+    block = re.split(r"\n {4}\w+:", (settings.__doc__ or "").split("Args:")[1])[0]
     return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
 
 
@@ -198,7 +204,7 @@ def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
     add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
     add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
     _add_fields(parser, RunConfig, "", preset)
-    bodies = f"{', '.join(NAMED_BODIES)}, or a mapping: '{{class: MLP, hidden: [64]}}'"
+    bodies = f"{', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: '{{class: MLP, hidden: [64]}}'"
     add("--body", type=dict | str | None, metavar="NAME", help=f"network body: {bodies}")
     add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
     add("--layer_norm", type=bool | None, metavar="{true,false}", help="layer normalisation in the network")
@@ -216,6 +222,7 @@ def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
     add("--workers", type=int, metavar="N", help="how many seeds at a time (default: as many as there are cores)")
     add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
     add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
+    add("--hook", type=str, metavar="module:name", help="function or class of your own that takes every row of metrics")
     add("--json", action="store_true", help="print the result as one JSON object on the last line")
     group = parser.add_argument_group(f"options of the {learner} learner")
     _add_fields(group, LEARNERS[learner], f"{learner}.", preset.get(learner, {}))
@@ -233,19 +240,23 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
     if known.layout not in NETWORKS:  # a preset's body is for networks
         preset = {name: value for name, value in preset.items() if name != "body"}
+    has_preset = bool(preset)
     if {"-h", "--help"} & set(rest):
         print(_as_typed(_build(known.learner, preset).format_help()))
         return None
     _refuse_other_learners(rest, known.learner)
     given = _build(known.learner, preset).parse_args(rest, defaults=False).as_dict()
+    preset, notes = cut_to_budget(preset, {**file, **given, "learner": known.learner})
     options = TrainOptions(
         run_dir=given.pop("run_dir", None),
         tensorboard=given.pop("tensorboard", False),
         wandb=given.pop("wandb", False),
+        hook=given.pop("hook", None),
         seeds=given.pop("seeds", None),
         workers=given.pop("workers", None),
         json=given.pop("json", False),
-        preset=bool(preset),
+        preset=has_preset,
+        notes=tuple(notes),
     )
     _check_counts(options)
     printed = given.pop("print_config", False)
@@ -287,5 +298,7 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
         body = values.get("body") or {}
         if isinstance(body, str) and body in NAMED_BODIES:
             body = body_to_dict(NAMED_BODIES[body])
+        elif isinstance(body, str) and ":" in body:
+            body = {"class": "Custom", "module": body}
         values["body"] = {"class": "MLP", **body, **short} if isinstance(body, dict) else body
     return values

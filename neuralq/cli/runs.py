@@ -14,14 +14,15 @@ from neuralq.best import load_best
 from neuralq.checkpoint import CheckpointError
 from neuralq.cli import Failure, command_parser, print_result
 from neuralq.cli.options import parse_train
-from neuralq.cli.sweeps import resume_seeds, single_run, train_seeds
-from neuralq.hooks import ProgressBar, TensorBoard, WeightsAndBiases
-from neuralq.recipes import Run, evaluate_run
+from neuralq.cli.sweeps import is_td_gammon_run, resume_seeds, single_run, started_from, train_seeds
+from neuralq.hooks import ProgressBar, TensorBoard, WeightsAndBiases, own_hook
+from neuralq.recipes import Run, RunConfig, evaluate_run
 from neuralq.recipes import resume as resume_run
 from neuralq.recipes import train as train_run
 from neuralq.recipes.config import config_from_dict, config_to_dict
 from neuralq.record import default_run_path, read_config, refuse_old_run
 from neuralq.report import MissingExtra, write_report
+from neuralq.rules import Linear
 from neuralq.sweep import is_sweep_folder
 from neuralq.training import Hook
 
@@ -30,6 +31,10 @@ __all__ = ["evaluate", "report", "resume", "train"]
 
 def train(argv: list[str]) -> int:
     """Train as the options say; exit status 0 only if the target was reached, where one was set."""
+    if argv[:1] == ["td-gammon"]:
+        from neuralq.cli.backgammon import train_td_gammon
+
+        return train_td_gammon(argv[1:])
     parsed = parse_train(argv)
     if parsed is None:
         return 0
@@ -38,17 +43,18 @@ def train(argv: list[str]) -> int:
         return train_seeds(config, options)
     path = Path(options.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
     refuse_old_run(path)  # also by train_run, but preparing takes seconds
-    preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
-    _say(f"run folder {path}{preset}; preparing (the first run on a machine compiles kernels)")
+    origin = started_from(config, options)
+    _say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
     with contextlib.ExitStack() as stack:
         hooks: list[Hook] = []
         if options.tensorboard:
             hooks.append(stack.enter_context(contextlib.closing(TensorBoard(path / "tensorboard"))))
         if options.wandb:
             hooks.append(stack.enter_context(contextlib.closing(WeightsAndBiases(path, config_to_dict(config)))))
-        hooks.append(stack.enter_context(ProgressBar(config.total_steps, config.stop_at_return)))
+        hooks += _own(options.hook, stack)
+        hooks.append(stack.enter_context(_bar(config, config.total_steps)))
         run = train_run(config, path, hooks)
-    return _conclude(run, options.json, config.stop_at_return)
+    return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
 
 def resume(argv: list[str]) -> int:
@@ -60,9 +66,19 @@ def resume(argv: list[str]) -> int:
     )
     parser.add_argument("run", help="run folder, or sweep folder")
     parser.add_argument("--total-steps", type=int, help="a new budget; lets a finished run go on")
+    parser.add_argument("--games", type=int, metavar="N", help="of a TD-Gammon run: a new budget")
     parser.add_argument("--workers", type=int, metavar="N", help="of a sweep: how many seeds at a time")
+    parser.add_argument("--hook", metavar="module:name", help="of a single run: as for neuralq train")
     options = parser.parse_args(argv)
+    if is_td_gammon_run(options.run):
+        from neuralq.cli.backgammon import resume_td_gammon
+
+        return resume_td_gammon(options)
+    if options.games is not None:
+        raise Failure(f"--games is for a TD-Gammon run, and there is none in {options.run}; leave it out", 2)
     if is_sweep_folder(options.run):
+        if options.hook is not None:
+            raise Failure("a sweep goes on with the hook that it was begun with; leave --hook out", 2)
         return resume_seeds(options.run, options.total_steps, options.workers, options.json)
     if options.workers is not None:
         raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
@@ -75,15 +91,39 @@ def resume(argv: list[str]) -> int:
         if (Path(options.run) / "wandb").is_dir():  # with --wandb
             tracker = WeightsAndBiases(options.run, config_to_dict(config))
             hooks.append(stack.enter_context(contextlib.closing(tracker)))
-        hooks.append(stack.enter_context(ProgressBar(options.total_steps or config.total_steps, config.stop_at_return)))
+        hooks += _own(options.hook, stack)
+        hooks.append(stack.enter_context(_bar(config, options.total_steps or config.total_steps)))
         run = resume_run(options.run, options.total_steps, hooks)
-    return _conclude(run, options.json, config.stop_at_return)
+    return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
+
+
+def _bar(config: RunConfig, total_steps: int) -> ProgressBar:
+    epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
+    return ProgressBar(total_steps, config.stop_at_return, epsilon=epsilon.value)
+
+
+def _own(name: str | None, stack: contextlib.ExitStack) -> list[Hook]:
+    """The user's own hook, if there is one, closed at the end if it can be."""
+    if name is None:
+        return []
+    hook = own_hook(name)
+    close = getattr(hook, "close", None)
+    if callable(close):
+        stack.callback(close)
+    return [hook]
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play greedy episodes with a run's newest checkpoint, or its best."""
+    """Play greedy episodes with a run's newest checkpoint, or its best; or a match of backgammon."""
+    if any(map(_is_about_backgammon, argv)):
+        from neuralq.cli.backgammon_match import evaluate_backgammon
+
+        return evaluate_backgammon(argv)
     parser = command_parser(
-        "evaluate", "Play greedy episodes with a trained run.", "neuralq evaluate RUN --episodes 100"
+        "evaluate",
+        "Play greedy episodes with a trained run. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
+        "neuralq evaluate RUN --episodes 100",
+        "neuralq evaluate RUN --against gnubg --games 5000",
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
@@ -124,11 +164,17 @@ def report(argv: list[str]) -> int:
     return 0
 
 
+def _is_about_backgammon(argument: str) -> bool:
+    """Whether it names a player of backgammon, or asks what only such a player can do."""
+    only_there = argument.startswith(("--against", "--error-rate")) or argument.endswith(".safetensors")
+    return only_there or is_td_gammon_run(argument)
+
+
 def _say(line: str) -> None:
     print(f"neuralq: {line}", file=sys.stderr, flush=True)
 
 
-def _conclude(run: Run, as_json: bool, target: float | None) -> int:
+def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> int:
     try:
         report_path = str(write_report(run.run_dir))
     except MissingExtra as error:
@@ -137,6 +183,8 @@ def _conclude(run: Run, as_json: bool, target: float | None) -> int:
     if run.interrupted_by is not None:
         _say(f"{run.interrupted_by}: saved at {run.env_steps:,} steps; go on with: neuralq resume {run.run_dir}")
     _say(run.resumability)
+    if run.engine != "compiled" and not forced:
+        _say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")
     best = _best_return(run)
     summary = {**run.summary(), "best_return": best, "report": report_path}
     score = "not evaluated" if run.greedy_return is None else f"greedy return {run.greedy_return:.1f}"

@@ -17,9 +17,10 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from neuralq.aggregate import interquartile_mean
 from neuralq.cli import Failure, main, print_result
 from neuralq.cli.options import TrainOptions
+from neuralq.hooks import own_hook
 from neuralq.recipes import RunConfig
 from neuralq.recipes.config import config_to_dict
-from neuralq.record import default_run_path, is_run_folder
+from neuralq.record import default_run_path, is_run_folder, read_config
 from neuralq.sweep import (
     Status,
     Sweep,
@@ -32,7 +33,7 @@ from neuralq.sweep import (
     stop_with_parent,
 )
 
-__all__ = ["SweepBar", "child", "resume_seeds", "single_run", "train_seeds"]
+__all__ = ["SweepBar", "child", "is_td_gammon_run", "resume_seeds", "single_run", "started_from", "train_seeds"]
 
 _QUIET_SECONDS = 10.0
 _CHILD = "from neuralq.cli.sweeps import child; child()"
@@ -44,10 +45,20 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     single = default_run_path(config.env, config.layout, config.seed, datetime.now())
     path = Path(options.run_dir or single.with_name(f"sweep-{single.name}"))
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
+    if options.hook is not None:
+        own_hook(options.hook)  # a name that is wrong is one error, not one for each seed
+        flags += ["--hook", options.hook]
     seeds = range(config.seed, config.seed + options.seeds)
     sweep = create_sweep(path, config_to_dict(config), seeds, flags)
+    return _run(sweep, options.workers, options.json, started_from(config, options))
+
+
+def started_from(config: RunConfig, options: TrainOptions) -> str:
+    """Where the settings come from that nobody gave, for the first line of a run."""
     preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
-    return _run(sweep, options.workers, options.json, preset)
+    if not options.notes:
+        return preset
+    return f"{preset}; within {config.total_steps:,} steps {', '.join(options.notes)}"
 
 
 def resume_seeds(path: str | Path, total_steps: int | None, num_workers: int | None, as_json: bool) -> int:
@@ -56,15 +67,26 @@ def resume_seeds(path: str | Path, total_steps: int | None, num_workers: int | N
 
 
 def single_run(path: str) -> Path:
-    """The folder of one run.
+    """The folder of one run on an environment.
 
     Raises:
-        Failure: if a sweep is there, whose seeds are runs.
+        Failure: if a sweep is there, whose seeds are runs, or a run of TD-Gammon.
     """
     if is_sweep_folder(path):
         seed = open_sweep(path).seeds[0]
         raise Failure(f"{path} is a sweep of several runs; name one of them, e.g. {Path(path) / f'seed-{seed}'}", 2)
+    if is_td_gammon_run(path):
+        raise Failure(
+            f"{path} is a TD-Gammon run, which is measured by `neuralq evaluate {path} --against pubeval` and played "
+            f"by `neuralq play backgammon --agent {path}`",
+            2,
+        )
     return Path(path)
+
+
+def is_td_gammon_run(path: str | Path) -> bool:
+    """Whether a run is there that has learned backgammon, and knows no environment."""
+    return is_run_folder(path) and read_config(path).get("kind") == "td-gammon"
 
 
 def child() -> None:
@@ -77,14 +99,16 @@ def _command(sweep: Sweep, seed: int) -> list[str]:
     begin = [sys.executable, "-c", _CHILD]
     path = str(sweep.run_path(seed))
     if is_run_folder(path):
-        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps)]
+        options = list(sweep.options)
+        hook = options[(at := options.index("--hook")) : at + 2] if "--hook" in options else []
+        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *hook]
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
 
 
-def _run(sweep: Sweep, num_workers: int | None, as_json: bool, preset: str) -> int:
+def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:
     workers = min(num_workers or num_cores(), len(sweep.seeds))
-    print(f"neuralq: sweep folder {sweep.path}{preset}; {len(sweep.seeds)} seeds, {workers} at a time", file=sys.stderr)
+    print(f"neuralq: sweep folder {sweep.path}{origin}; {len(sweep.seeds)} seeds, {workers} at a time", file=sys.stderr)
     with SweepBar(len(sweep.seeds)) as bar:
         result = run_sweep(sweep, _command, num_workers, bar)
     target = sweep.config.get("stop_at_return")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from neuralq.checks import check_discount, check_fraction, check_positive
 from neuralq.lab.sampled import SampleDiagnosis
-from neuralq.learners import OnlineSettings, ReplaySettings, StreamingSettings
+from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, StreamingSettings
 from neuralq.recipes import RunConfig
 
 __all__ = ["RunTraits", "advise"]
@@ -63,6 +63,9 @@ class RunTraits:
             return cls(gamma, settings.step_size, True, settings.lambda_, None, layer_norm, reward_scale=scale)
         if isinstance(settings, StreamingSettings):  # its steps are bounded
             return cls(gamma, settings.eta_or_alpha, False, settings.lambda_, None, layer_norm, reward_scale=scale)
+        if isinstance(settings, GradientSettings):
+            decay = settings.rule.lambda_
+            return cls(gamma, settings.step_size, True, decay, None, layer_norm, reward_scale=scale)
         replay = isinstance(settings, ReplaySettings)
         one_step = isinstance(settings, ReplaySettings) and settings.block_length == 1
         return cls(

@@ -6,6 +6,10 @@ library, what is held fixed when a gradient is taken. `RolloutLearner` uses the 
 return; `OnlineLearner` and `PredictionLearner` the backward view with eligibility traces, one step at a time;
 `StreamingLearner` as well, with a step that is bounded by what it would do.
 
+Prediction is control with one action. True online TD(λ) is `PredictionLearner` with ``trace="dutch"`` on a table or
+linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
+a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
+
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 """
@@ -14,6 +18,7 @@ from neuralq.learners.batch import ReplayLearner
 from neuralq.learners.correction import HeadCorrection, TangentCorrection
 from neuralq.learners.distributional import DistributionalLearner
 from neuralq.learners.dqrc import DQRCLearner, DQRCSettings, TwinHead
+from neuralq.learners.gradient_settings import GradientSettings
 from neuralq.learners.gradient_step import GradientTDSettings
 from neuralq.learners.gradient_td import GradientPredictionLearner, GradientQLearner
 from neuralq.learners.online import OnlineLearner, OnlineSettings, PredictionLearner
@@ -30,6 +35,7 @@ __all__ = [
     "DistributionalLearner",
     "GradientPredictionLearner",
     "GradientQLearner",
+    "GradientSettings",
     "GradientTDSettings",
     "HeadCorrection",
     "Learner",

@@ -211,6 +211,13 @@ class StreamingLearner:
         """Updates so far."""
         return self._steps.num_updates
 
+    @property
+    def engine_name(self) -> str:
+        """What computes: "compiled" kernels altogether, "torch", or "compiled and torch", each a part."""
+        if self._network is not None:
+            return "compiled"
+        return "compiled and torch" if self._compiled else "torch"
+
     def values(self, s: Tensor) -> Tensor:
         """Action values ``[N, *obs] -> [N, A]`` for acting, the quick way where there is one."""
         return self.engine.all(s) if self._network is None else self._network.values(s)

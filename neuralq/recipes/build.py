@@ -17,9 +17,11 @@ from neuralq.features import OneHot, Pixels, encoder_for
 from neuralq.feed import Feed, OnlineFeed, ReplayFeed, RolloutFeed
 from neuralq.interact import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.learners import (
+    GradientSettings,
     Learner,
     OnlineLearner,
     OnlineSettings,
+    ReplayLearner,
     ReplaySettings,
     RolloutLearner,
     RolloutSettings,
@@ -28,9 +30,10 @@ from neuralq.learners import (
 )
 from neuralq.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
-from neuralq.q.engine import Engine, Loss, make_engine
+from neuralq.q.engine import Engine, Loss, MlpEngine, array_values, make_engine
 from neuralq.recipes.config import RunConfig
 from neuralq.recipes.games import ATARI, make_single, register_games
+from neuralq.recipes.gradient import gradient_learner, started_at_zero
 from neuralq.recipes.replay import as_distribution, num_atoms, replay_learner
 from neuralq.replay import Prioritised, ReplayBuffer
 from neuralq.rules import Linear
@@ -39,7 +42,7 @@ from neuralq.training import Plan, Session, seed_for
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
-__all__ = ["build_q", "build_session", "make_envs", "normalisation_for", "plan_of"]
+__all__ = ["build_q", "build_session", "engine_name", "make_envs", "normalisation_for", "plan_of"]
 
 _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]] = {
     "action-input": ActionInputQ,
@@ -48,11 +51,16 @@ _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]]
 }
 
 
-def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
+def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> VectorEnv[Any, Any, Any]:
     """Parallel environments: the registered vectorised implementation where there is one, else one after another.
 
     Gymnasium's Mountain Car and Acrobot are vectorised by `neuralq_envs.classic`, which repeats them to the bit.
     Elsewhere a single environment is stepped directly, which is quicker than a batch of one.
+
+    Args:
+        config: says which environment.
+        num_envs: how many.
+        training: whether rewards are clipped, and lives counted for episodes, where the configuration wants that.
 
     Raises:
         ValueError: if the environment is not registered or cannot be made, with what to do about it.
@@ -68,7 +76,8 @@ def make_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
             return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
         if num_envs > 1 and spec.vector_entry_point is not None and not env_id.startswith(ATARI):
             return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
-        return make_vector_env(lambda: make_single(env_id, config.env_kwargs), num_envs)
+        clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
+        return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
     except gym.error.Error as error:
         raise ValueError(
             f"cannot make the environment {config.env!r}: {str(error).rstrip('.')}. Name a registered Gymnasium id; an "
@@ -125,7 +134,7 @@ def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Norm
         ValueError: where state indices would have to be normalised.
     """
     settings = config.settings
-    if not isinstance(settings, StreamingSettings | RolloutSettings):
+    if not isinstance(settings, StreamingSettings | GradientSettings | RolloutSettings):
         return None
     if isinstance(settings, RolloutSettings) and not settings.normalise_observations:
         return None
@@ -134,7 +143,7 @@ def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Norm
     if is_index and settings.normalise_observations:
         raise ValueError("state indices have no mean to subtract; leave normalise_observations out")
     observations = not is_index if settings.normalise_observations is None else settings.normalise_observations
-    rewards = isinstance(settings, StreamingSettings) and settings.scale_rewards
+    rewards = not isinstance(settings, RolloutSettings) and settings.scale_rewards
     if not observations and not rewards:
         return None
     num_lanes = getattr(settings, "num_envs", 1)  # as in training, also where one environment is made to play
@@ -150,7 +159,7 @@ def build_session(config: RunConfig) -> Session:
     _check_device(config.device)
     settings = config.settings
     num_envs = getattr(settings, "num_envs", 1)
-    envs = make_envs(config, num_envs)
+    envs = make_envs(config, num_envs, training=True)
     as_index = config.layout == "table"
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
@@ -160,21 +169,37 @@ def build_session(config: RunConfig) -> Session:
         q.to(config.device)
     loss = Loss("huber" if isinstance(settings, ReplaySettings) and settings.loss == "huber" else "squared")
     engine = make_engine(q, loss, config.engine)
-    learner = _learner(config, engine, generators["samples"])
+    learner = _learner(config, engine, stream.spec, generators["samples"])
     feed = _feed(config, stream.spec, num_envs, generators["samples"])
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     values = learner.values if isinstance(learner, StreamingLearner) else engine.all
-    policy = epsilon_greedy_policy(values, lambda: epsilon.value(stream.num_steps), generators["policy"])
+    arrays = None if isinstance(learner, StreamingLearner) else array_values(engine)
+    policy = epsilon_greedy_policy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     evaluation_envs = make_envs(config, config.evaluation_episodes)
     frozen = None if normalisation is None else normalisation.frozen()
     evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index, frozen)
     probe = is_resumable(
-        lambda: make_envs(config, num_envs), seed_for(config.seed, 5), np.random.default_rng(seed_for(config.seed, 6))
+        lambda: make_envs(config, num_envs, training=True),
+        seed_for(config.seed, 5),
+        np.random.default_rng(seed_for(config.seed, 6)),
     )
     _warm(engine, stream, settings)
     if isinstance(settings, StreamingSettings):
         _warm_streaming(config, engine, stream)
     return Session(stream, policy, feed, learner, generators, evaluation, probe)
+
+
+def engine_name(learner: Learner) -> str:
+    """What computes for a learner: "compiled" kernels, "torch", or "compiled and torch", each what it can.
+
+    Kernels know tables, linear functions and convolutions only in part; where they know nothing torch steps in, and a
+    run should be able to say so.
+    """
+    if isinstance(learner, StreamingLearner):
+        return learner.engine_name
+    if not isinstance(learner.engine, MlpEngine):
+        return "torch"
+    return "compiled" if isinstance(learner, RolloutLearner | ReplayLearner | OnlineLearner) else "compiled and torch"
 
 
 def _check_device(device: str) -> None:
@@ -187,7 +212,7 @@ def _check_device(device: str) -> None:
         raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works")
 
 
-def _learner(config: RunConfig, engine: Engine, rng: np.random.Generator) -> Learner:
+def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.random.Generator) -> Learner:
     settings = config.settings
     if isinstance(settings, RolloutSettings):
         rows = settings.num_envs * settings.num_steps
@@ -197,6 +222,11 @@ def _learner(config: RunConfig, engine: Engine, rng: np.random.Generator) -> Lea
         return replay_learner(config, engine)
     if isinstance(settings, StreamingSettings):
         return StreamingLearner(engine, settings, config.gamma, config.reward_scale, _kernels(config))
+    if isinstance(settings, GradientSettings):
+        head = started_at_zero(build_q(config, spec, np.random.default_rng(seed_for(config.seed, 11))))
+        if isinstance(head, nn.Module):
+            head.to(config.device)
+        return gradient_learner(engine, settings, head, config.reward_scale)
     return OnlineLearner(engine, settings, 1, config.reward_scale)
 
 
@@ -208,7 +238,7 @@ def _feed(config: RunConfig, spec: ObservationSpec, num_envs: int, rng: np.rando
     settings = config.settings
     if isinstance(settings, RolloutSettings):
         return RolloutFeed(settings.num_steps, num_envs, spec)
-    if isinstance(settings, OnlineSettings | StreamingSettings):
+    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
         return OnlineFeed(num_envs, spec)
     buffer = _buffer(settings, spec, settings.capacity)
     return ReplayFeed(
@@ -229,7 +259,7 @@ def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
     s = torch.from_numpy(stream.state_dict()["s"])
     q = engine.all(s)
     a, _ = choose_epsilon_greedy(q, 0.5, np.full(len(s), 0.5))
-    if isinstance(settings, OnlineSettings | StreamingSettings):
+    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
         return
     engine.loss_gradient(s, a.to(q.device), torch.zeros(len(s), dtype=q.dtype, device=q.device))
     engine.flat.grad.zero_()

@@ -10,20 +10,23 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
-from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
-from neuralq.q import MLP, NAMED_BODIES, Conv
+from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+from neuralq.q import MLP, NAMED_BODIES, Body, Conv, Custom
+from neuralq.recipes.games import is_screen
 
 __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict"]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
-LEARNERS: dict[str, type[RolloutSettings] | type[ReplaySettings] | type[OnlineSettings] | type[StreamingSettings]] = {
+Settings = RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings | GradientSettings
+LEARNERS: dict[str, type[Settings]] = {
     "rollout": RolloutSettings,
     "replay": ReplaySettings,
     "online": OnlineSettings,
     "streaming": StreamingSettings,
+    "gradient": GradientSettings,
 }
 NETWORKS = ("action-input", "separate", "action-output")
-BODIES: dict[str, type[MLP] | type[Conv]] = {"MLP": MLP, "Conv": Conv}
+BODIES: dict[str, type[MLP] | type[Conv] | type[Custom]] = {"MLP": MLP, "Conv": Conv, "Custom": Custom}
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 
 
@@ -34,7 +37,9 @@ class RunConfig:
     Args:
         env: Gymnasium id, or "module:id" to import a module that registers it.
         env_kwargs: passed to `gymnasium.make`.
-        learner: "rollout", "replay", "online" or "streaming".
+        clip_rewards: whether training sees rewards clipped to between −1 and 1 (Mnih et al., 2015); Atari screens only.
+        end_on_life_loss: whether in training a lost life ends the game and begins another; Atari screens only.
+        learner: "rollout", "replay", "online", "streaming" or "gradient".
         layout: "table", "linear", "action-input", "separate" or "action-output".
         seed: from which every generator is derived.
         total_steps: environment steps, summed over parallel environments.
@@ -44,12 +49,14 @@ class RunConfig:
         epsilon_start: exploration at the first step.
         epsilon_end: exploration after ``epsilon_decay_steps``, reached linearly.
         epsilon_decay_steps: environment steps.
-        body: network body, MLP or Conv; networks only. None picks MLP, or Conv for images.
+        body: network body, MLP, Conv or Custom (a module of your own); networks only. None picks MLP, or Conv for
+            images.
         dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
         rollout: settings of the rollout learner; only with ``learner="rollout"``.
         replay: settings of the replay learner; only with ``learner="replay"``.
         online: settings of the online learner; only with ``learner="online"``.
         streaming: settings of the streaming learner; only with ``learner="streaming"``.
+        gradient: settings of the gradient-TD learner; only with ``learner="gradient"``.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
         evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
@@ -62,6 +69,8 @@ class RunConfig:
 
     env: str = "CartPole-v1"
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    clip_rewards: bool = False
+    end_on_life_loss: bool = False
     learner: str = "rollout"
     layout: str = "action-output"
     seed: int = 0
@@ -72,12 +81,13 @@ class RunConfig:
     epsilon_start: float = 1.0
     epsilon_end: float = 0.05
     epsilon_decay_steps: int = 20_000
-    body: MLP | Conv | None = None
+    body: MLP | Conv | Custom | None = None
     dueling: bool = False
     rollout: RolloutSettings | None = None
     replay: ReplaySettings | None = None
     online: OnlineSettings | None = None
     streaming: StreamingSettings | None = None
+    gradient: GradientSettings | None = None
     evaluate_every: int = 4096
     evaluation_episodes: int = 20
     evaluation_max_steps: int = 10_000
@@ -121,18 +131,28 @@ class RunConfig:
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
                     f"use learner={name!r} or leave them out"
                 )
-        if self.body is not None and self.layout not in NETWORKS:
-            what = "table" if self.layout == "table" else "linear function"
-            raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
-        if self.engine == "compiled" and (self.layout not in NETWORKS or isinstance(self.body, Conv)):
-            raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+        _check_body(self)
         _check_outputs(self)
+        _check_game(self)
 
     @property
-    def settings(self) -> RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings:
+    def settings(self) -> Settings:
         """The settings of the learner that runs."""
-        chosen: RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings = getattr(self, self.learner)
+        chosen: Settings = getattr(self, self.learner)
         return chosen
+
+
+def _check_body(config: RunConfig) -> None:
+    """Networks have bodies, and kernels know some of them."""
+    if config.body is not None and config.layout not in NETWORKS:
+        what = "table" if config.layout == "table" else "linear function"
+        raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
+    if config.engine == "compiled" and (config.layout not in NETWORKS or isinstance(config.body, Conv | Custom)):
+        raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+    if config.engine == "compiled" and config.learner == "gradient":
+        raise ValueError(
+            "engine='compiled' has no kernels for gradient TD, whose steps need three gradients; use engine='auto'"
+        )
 
 
 def _check_outputs(config: RunConfig) -> None:
@@ -151,6 +171,11 @@ def _check_outputs(config: RunConfig) -> None:
             f"distribution={distribution!r} needs several outputs per action, and {config.layout} networks have one "
             "output each; use layout='action-output', 'linear' or 'table'"
         )
+    if config.layout == "action-input" and isinstance(config.body, Custom) and not config.body.hidden:
+        raise ValueError(
+            "without a layer after it the action would be added to what the body says of the state, and one action be "
+            "best everywhere; give the body hidden=(width,), or use another layout"
+        )
     if config.dueling and config.replay is not None and config.replay.target_rule == "dqrc":
         raise ValueError(
             "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
@@ -160,7 +185,13 @@ def _check_outputs(config: RunConfig) -> None:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
-def body_to_dict(body: MLP | Conv) -> dict[str, Any]:
+def _check_game(config: RunConfig) -> None:
+    for name, way_out in (("clip_rewards", "use reward_scale"), ("end_on_life_loss", "leave it out")):
+        if getattr(config, name) and not is_screen(config.env, config.env_kwargs):
+            raise ValueError(f"{name} is for the screens of Atari games (ALE/...), got {config.env!r}; {way_out}")
+
+
+def body_to_dict(body: Body) -> dict[str, Any]:
     """A body as configurations write it: its class and its settings.
 
     Example:
@@ -194,21 +225,32 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
         True
     """
     values = dict(plain)
+    if values.get("kind") == "td-gammon":
+        raise ValueError("this is the configuration of a TD-Gammon run; neuralq.backgammon.config reads those")
     _refuse_unknown("the configuration", values, RunConfig)
     for name, settings in LEARNERS.items():
         if values.get(name) is not None:
             values[name] = settings(**_fitted(name, values[name], settings))
     if values.get("body") is not None:
-        if isinstance(values["body"], str) and values["body"] in NAMED_BODIES:
-            values["body"] = body_to_dict(NAMED_BODIES[values["body"]])
-        if not isinstance(values["body"], Mapping):
-            known = ", ".join(NAMED_BODIES)
-            raise ValueError(f"body must be a mapping with a class, or one of {known}, got {values['body']!r}")
-        body = dict(values["body"])
+        body = _body_of(values["body"])
         check_choice("class of the body", body.get("class"), BODIES)
         kind = BODIES[body.pop("class")]
         values["body"] = kind(**_fitted("body", body, kind))
     return RunConfig(**values)
+
+
+def _body_of(given: Any) -> dict[str, Any]:
+    """A body as a mapping, by whatever it was named."""
+    if isinstance(given, str) and given in NAMED_BODIES:
+        return body_to_dict(NAMED_BODIES[given])
+    if isinstance(given, str) and ":" in given:
+        return {"class": "Custom", "module": given}
+    if not isinstance(given, Mapping):
+        known = ", ".join(NAMED_BODIES)
+        raise ValueError(
+            f"body must be a mapping with a class, one of {known}, or 'module:Class' of your own, got {given!r}"
+        )
+    return dict(given)
 
 
 def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:

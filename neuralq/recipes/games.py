@@ -1,10 +1,12 @@
-"""Games of the extras: MinAtar (Young & Tian 2019) and Atari 2600 (Bellemare et al. 2013), registered when asked for.
+"""Games of the extras: MinAtar (Young & Tian 2019), Atari 2600 (Bellemare et al. 2013) and Gymnasium's with Box2D.
 
-Gymnasium looks for ``MinAtar/...`` and ``ALE/...`` only after the package that has them was told to register them. An
-Atari screen is not played from as it is: 84 × 84 grey frames, the brighter of the last two of every four screens, the
-last four of them stacked, and up to 30 idle steps at the start (Mnih et al. 2015), by Gymnasium's own wrappers. Rewards
-are those of the game, and a lost life does not end the episode. The emulator's vectorised implementation is left alone:
-it takes as much CPU time per step as these do (measured), and hands out clipped rewards.
+Gymnasium looks for ``MinAtar/...`` and ``ALE/...`` only after the package that has them was told to register them; ids
+such as ``LunarLander-v3`` it always knows, and misses their engine, Box2D, only when one is made. An Atari screen is
+not played from as it is: 84 × 84 grey frames, the brighter of the last two of every four screens, the last four of them
+stacked, and up to 30 idle steps at the start (Mnih et al. 2015), by Gymnasium's own wrappers. Rewards are those of the
+game, and a lost life does not end the episode, unless a run asks for that in training; it is evaluated without. The
+emulator's vectorised implementation is left alone: it takes as much CPU time per step as these do (measured), and hands
+out clipped rewards.
 """
 
 from __future__ import annotations
@@ -15,13 +17,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
-__all__ = ["ATARI", "MINATAR", "make_single", "register_games"]
+__all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "register_games"]
 
 MINATAR, ATARI = "MinAtar/", "ALE/"
 _NUM_NOOPS, _FRAME_SKIP, _SIDE, _NUM_STACKED = 30, 4, 84, 4
 _CELL = 24
+_BOX2D = "gymnasium.envs.box2d."  # where Gymnasium's registry says that these are
 
 
 def register_games(env_id: str) -> None:
@@ -33,6 +36,11 @@ def register_games(env_id: str) -> None:
     Example:
         >>> register_games("CartPole-v1")  # nothing to do
     """
+    if str(getattr(gym.registry.get(env_id), "entry_point", "")).startswith(_BOX2D):
+        try:
+            importlib.import_module("Box2D")
+        except ImportError as error:
+            raise _missing(env_id, "box2d", error) from error
     for prefix, module, extra in ((MINATAR, "minatar.gym", "minatar"), (ATARI, "ale_py", "atari")):
         if env_id.startswith(prefix) and not any(known.startswith(prefix) for known in gym.registry):
             try:
@@ -40,20 +48,30 @@ def register_games(env_id: str) -> None:
                 if extra == "atari":
                     importlib.import_module("cv2")  # Gymnasium's preprocessing resizes with it
             except ImportError as error:
-                raise ValueError(
-                    f"{env_id} needs the extra {extra!r} ({error}): pip install 'neuralq[{extra}]'"
-                ) from error
+                raise _missing(env_id, extra, error) from error
             if extra == "minatar":
                 games.register_envs()
 
 
-def make_single(env: str, env_kwargs: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
+def _missing(env_id: str, extra: str, error: ImportError) -> ValueError:
+    return ValueError(f"{env_id} needs the extra {extra!r} ({error}): pip install 'neuralq[{extra}]'")
+
+
+def make_single(
+    env: str,
+    env_kwargs: Mapping[str, Any],
+    render_mode: str | None = None,
+    clip_rewards: bool = False,
+    end_on_life_loss: bool = False,
+) -> gym.Env[Any, Any]:
     """One environment, by the id that a configuration gives; Atari games come preprocessed.
 
     Args:
         env: Gymnasium id, or "module:id".
         env_kwargs: passed to `gymnasium.make`.
         render_mode: how it is to be drawn, if at all.
+        clip_rewards: of Atari screens, to between −1 and 1.
+        end_on_life_loss: of Atari screens, whether a lost life terminates the episode; the next one is a new game.
 
     Example:
         >>> make_single("CartPole-v1", {}).action_space.n
@@ -64,12 +82,15 @@ def make_single(env: str, env_kwargs: Mapping[str, Any], render_mode: str | None
     if env.startswith(MINATAR) and kwargs.get("render_mode") == "rgb_array":
         # Its pictures are floats of 10 × 10, at which the checker would take offence at every one.
         return _Enlarged(gym.make(env, disable_env_checker=True, **kwargs))
-    if not _is_screen(env, env_kwargs):
+    if not is_screen(env, env_kwargs):
         return gym.make(env, **kwargs)
     frame_skip = kwargs.pop("frameskip", _FRAME_SKIP)
     game = gym.make(env, frameskip=1, **kwargs)
-    frames = AtariPreprocessing(game, noop_max=_NUM_NOOPS, frame_skip=frame_skip, screen_size=_SIDE)
-    return FrameStackObservation(frames, _NUM_STACKED)
+    frames = AtariPreprocessing(
+        game, noop_max=_NUM_NOOPS, frame_skip=frame_skip, screen_size=_SIDE, terminal_on_life_loss=end_on_life_loss
+    )
+    stacked = FrameStackObservation(frames, _NUM_STACKED)
+    return ClipReward(stacked, -1.0, 1.0) if clip_rewards else stacked
 
 
 class _Enlarged(gym.Wrapper[Any, Any, Any, Any]):
@@ -84,5 +105,11 @@ class _Enlarged(gym.Wrapper[Any, Any, Any, Any]):
         return np.rint(255 * cells).astype(np.uint8).repeat(_CELL, 0).repeat(_CELL, 1)
 
 
-def _is_screen(env: str, env_kwargs: Mapping[str, Any]) -> bool:
+def is_screen(env: str, env_kwargs: Mapping[str, Any]) -> bool:
+    """Whether these are the pictures of an Atari game, which are preprocessed.
+
+    Example:
+        >>> is_screen("ALE/Pong-v5", {}), is_screen("ALE/Pong-v5", {"obs_type": "ram"}), is_screen("CartPole-v1", {})
+        (True, False, False)
+    """
     return env.startswith(ATARI) and env_kwargs.get("obs_type", "rgb") == "rgb"

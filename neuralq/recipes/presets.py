@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from neuralq.q.bodies import NAMED_BODIES
+from neuralq.recipes.budget import cut_to_budget
 from neuralq.recipes.config import NETWORKS, RunConfig, body_to_dict, config_from_dict
 
 __all__ = ["PRESETS", "preset_for", "with_preset"]
@@ -42,17 +43,17 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             "average_updates": 8.0,
         },
     },
-    # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves.
+    # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves: ε may fall soon.
     ("Acrobot-v1", "rollout"): {
         "total_steps": 200_000,
         "gamma": 0.995,
         "reward_scale": 0.1,
         "epsilon_end": 0.01,
-        "epsilon_decay_steps": 60_000,
+        "epsilon_decay_steps": 20_000,
         "evaluate_every": 10_000,
         "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
         "rollout": {
-            "lambda_": 0.9,
+            "lambda_": 0.6,
             "learning_rate": 5e-4,
             "num_envs": 16,
             "num_steps": 32,
@@ -83,6 +84,28 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             "anneal": True,
             "normalise_observations": True,
             "average_updates": 16.0,
+        },
+    },
+    # As CartPole: refreshed targets, and an average that plays. Observations are of similar size as they come, and the
+    # rewards of ±100 at the end become ±10.
+    ("LunarLander-v3", "rollout"): {
+        "total_steps": 500_000,
+        "gamma": 0.99,
+        "reward_scale": 0.1,
+        "epsilon_end": 0.02,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 25_000,
+        "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
+        "rollout": {
+            "lambda_": 0.9,
+            "learning_rate": 5e-4,
+            "num_envs": 16,
+            "num_steps": 32,
+            "num_epochs": 8,
+            "num_minibatches": 8,
+            "anneal": True,
+            "refresh_targets": True,
+            "average_updates": 32.0,
         },
     },
     # Plain gradient steps without replay or step bounds need small values and normalised layers to stay finite.
@@ -130,9 +153,10 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         }
         for game in _GAMES
     },
-    # Stream Q(λ) on MinAtar, as above but for the network and ε over the first fifth of 5,000,000 steps to 0.01.
+    # Stream Q(λ) on MinAtar, as above but for the network and ε over the first fifth of 5,000,000 steps to 0.01; QRC(λ)
+    # (Elelimy et al. 2025) as published, on the same network, with the defaults of `GradientSettings`.
     **{
-        (f"MinAtar/{game}-v1", "streaming"): {
+        (f"MinAtar/{game}-v1", learner): {
             **_MINATAR,
             "epsilon_end": 0.01,
             "epsilon_decay_steps": 1_000_000,
@@ -145,6 +169,7 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             },
         }
         for game in _GAMES
+        for learner in ("streaming", "gradient")
     },
     # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
     # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
@@ -183,6 +208,8 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
 def with_preset(plain: Mapping[str, Any]) -> RunConfig:
     """The configuration of what is given, over the preset of its environment and learner, over the defaults.
 
+    Schedules that are not given end within a ``total_steps`` that is (`neuralq.recipes.budget`).
+
     Args:
         plain: as `config_to_dict` writes it, or any part of that; settings of the learner may be partial too.
 
@@ -198,5 +225,6 @@ def with_preset(plain: Mapping[str, Any]) -> RunConfig:
     preset = preset_for(plain.get("env", RunConfig.env), learner)
     if plain.get("layout", RunConfig.layout) not in NETWORKS:
         preset = {name: value for name, value in preset.items() if name != "body"}
+    preset, _ = cut_to_budget(preset, plain)
     settings = {learner: {**preset.get(learner, {}), **(plain.get(learner) or {})}}
     return config_from_dict({**preset, **plain, **settings})

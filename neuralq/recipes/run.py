@@ -23,7 +23,7 @@ from neuralq.evaluation import Evaluation, evaluate_greedy
 from neuralq.features import discrete_actions
 from neuralq.interact import Interaction
 from neuralq.q.flat import FlatParameters
-from neuralq.recipes.build import build_q, build_session, make_envs, normalisation_for, plan_of
+from neuralq.recipes.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
 from neuralq.recipes.config import RunConfig, config_from_dict, config_to_dict
 from neuralq.record import RunFolder, default_run_path, read_config, refuse_old_run
 from neuralq.training import Hook, Progress, Session, fit, restore, seed_for
@@ -45,6 +45,7 @@ class Run:
         reached: whether ``stop_at_return`` was met; None where none was asked for.
         interrupted_by: name of the signal that ended it early, or None.
         resumability: how exactly it can be resumed, in words.
+        engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
     """
 
     run_dir: Path
@@ -56,6 +57,7 @@ class Run:
     reached: bool | None
     interrupted_by: str | None
     resumability: str
+    engine: str
 
     def summary(self) -> dict[str, Any]:
         """The same as plain values."""
@@ -148,22 +150,37 @@ def _conclude(config: RunConfig, session: Session, progress: Progress, folder: R
         reached=None if config.stop_at_return is None else progress.reached_at is not None,
         interrupted_by=progress.interrupted_by,
         resumability=session.resumability.reason,
+        engine=engine_name(session.learner),
     )
     folder.write_summary(run.summary())
     return run
 
 
-def load(run_dir: str | Path, best: bool = False) -> Agent:
+def load(run_dir: str | Path, best: bool = False) -> Any:
     """The agent of a run's newest checkpoint, or of its best evaluation.
 
     Args:
         run_dir: folder of the run.
         best: the parameters whose greedy evaluation scored highest, in place of the newest.
 
+    Returns:
+        A `neuralq.agent.Agent`; of a TD-Gammon run a `neuralq.backgammon.BackgammonAgent`.
+
     Raises:
         RunFolderError: if there is no run in the folder.
         CheckpointError: if no checkpoint is intact.
+        ValueError: if the best of a TD-Gammon run is asked for.
     """
+    if read_config(run_dir).get("kind") != "td-gammon":
+        return _load_agent(run_dir, best)
+    if best:
+        raise ValueError(f"a TD-Gammon run keeps its newest weights only, and {run_dir} is one; leave best out")
+    from neuralq.backgammon.run import load_agent  # its kernels are not everybody's
+
+    return load_agent(run_dir)
+
+
+def _load_agent(run_dir: str | Path, best: bool) -> Agent:
     config = config_from_dict(read_config(run_dir))
     parameters, statistics = _kept(Path(run_dir), best)
     envs = make_envs(config, 1)
@@ -207,7 +224,7 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
     check_whole("num_episodes", num_episodes)
     check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
-    agent = load(run_dir, best)
+    agent = _load_agent(run_dir, best)
     with _threads(config):
         envs = make_envs(config, min(num_episodes, 64))
         try:
