@@ -134,6 +134,7 @@ train_games(config_from_dict(json.loads(sys.argv[1])), sys.argv[2], [die])
 """
 
 
+@pytest.mark.slow
 def test_a_killed_process_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = configuration(SMALL)
     whole = train_games(config, tmp_path / "whole")

@@ -54,6 +54,7 @@ def test_a_row_is_made_of_interquartile_means_with_intervals() -> None:
     assert alone[4:] == ["490.0", "-", "49.0", "-", "2.0"], "one seed has no interval"
 
 
+@pytest.mark.slow
 def test_it_sweeps_and_prints_rows_and_json(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

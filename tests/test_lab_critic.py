@@ -74,6 +74,7 @@ def test_features_of_zero_move_nothing(name: str, sampling: str) -> None:
     assert "moves nothing" in found.explain()
 
 
+@pytest.mark.slow
 def test_nothing_that_moves_is_stable_everywhere() -> None:
     found = scan(one_state(x=((0.0, 0.0),)), "gamma")
     assert np.isfinite(found.margins).all() and found.boundaries == () and len(found.stable) == 1

@@ -183,6 +183,7 @@ def run_on_star(kind: str, seed: int, num_steps: int) -> float:
     return float(np.abs(X @ engine.flat.values.numpy()).max())
 
 
+@pytest.mark.slow
 def test_td_diverges_on_the_sampled_star_and_its_corrections_do_not() -> None:
     for seed in range(3):
         assert run_on_star("TD", seed, 500) > 90, "12 at the start"

@@ -108,7 +108,7 @@ LEARNED: dict[str, Any] = {
     "gradient, qrc": GradientSettings(**GRADIENT),
     "gradient, gq": GradientSettings(method="gq", **GRADIENT),
 }
-FAST = ("rollout, peng", "online, accumulating", "streaming, obgd", "gradient, qrc")
+FAST = ("rollout, peng", "online, accumulating", "streaming, obgd")
 
 
 def learned(name: str, mistake: str | None) -> Any:
