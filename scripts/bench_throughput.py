@@ -12,12 +12,12 @@ says how busy or slow this machine is. Training only: building, compiling and ev
 rounds; for example:
 
     learner                    ours [steps/CPU-s]   peer [steps/CPU-s]   ratio   peer
-    rollout, 4 x 128                       75,893                7,000   10.8x   CleanRL PQN, quiet machine
-    rollout, 64 x 128                     179,022               26,000    6.9x   CleanRL PQN, quiet machine
-    replay, 1 environment                  13,214                  460   28.7x   SB3 DQN, alternating
-    SB3 made 460 where a quiet machine makes 935; at equal speed the ratios would be:
-    rollout, 4 x 128                                                     22.0x
-    rollout, 64 x 128                                                    14.0x
+    rollout, 4 x 128                       50,362                7,000    7.2x   CleanRL PQN, quiet machine
+    rollout, 64 x 128                     196,811               26,000    7.6x   CleanRL PQN, quiet machine
+    replay, 1 environment                  13,126                1,041   12.6x   SB3 DQN, alternating
+    SB3 made 1,041 where a quiet machine makes 935; at equal speed the ratios would be:
+    rollout, 4 x 128                                                      6.5x
+    rollout, 64 x 128                                                     6.8x
 
 ``--json`` prints one JSON object as the last line: ``{"rollout, 4 x 128": {"ours": ..., "peer": ..., "ratio": ...}}``.
 """
