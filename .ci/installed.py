@@ -15,8 +15,9 @@ def main(wheel: str) -> None:
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert tops == {"neuralq", "neuralq_envs", "neuralq_plugin.pth"}, f"unexpected top-level names: {sorted(tops)}"
     assert {"neuralq/py.typed", "neuralq_envs/py.typed"} <= set(names), "a py.typed is missing"
-    page = {f"neuralq/web/static/{name}" for name in STATIC}
-    assert page <= set(names), f"the lab's page is incomplete: {sorted(page - set(names))} are missing"
+    page = {f"neuralq/web/static/{name}" for name in (*STATIC, "play/backgammon.html", "play/tictactoe.html")}
+    page.add("neuralq/backgammon/weights.safetensors")
+    assert page <= set(names), f"the pages are incomplete: {sorted(page - set(names))} are missing"
     strays = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc"))]
     assert not strays, f"caches in the wheel: {strays}"
 
@@ -33,6 +34,13 @@ def main(wheel: str) -> None:
         assert Path(sys.prefix) in Path(str(module.__file__)).parents, f"{module.__file__} is not the installed one"
     for name in neuralq.__all__:
         assert getattr(neuralq, name) is not None, name
+
+    from neuralq.backgammon import load_agent
+    from neuralq_envs.backgammon import Position
+
+    start = Position.initial()
+    five_point = load_agent().best_move(start, (3, 1))
+    assert five_point.gnubg_id == "sGfwATDgc/ABMA", "a trained network makes its five point with 3-1"
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ def test_the_slow_gradients_are_differences() -> None:
 
 
 @pytest.mark.parametrize("num_outputs", [1, 4, 6])
+@pytest.mark.slow
 def test_values_and_choices_are_those_of_all_inputs(num_outputs: int) -> None:
     rng = np.random.default_rng(2)
     boards = boards_of_random_games(3000, rng)
@@ -142,6 +143,7 @@ def test_the_value_of_a_million_positions_does_not_know_which_player_moves() -> 
 
 
 @pytest.mark.parametrize(("lambda_", "num_outputs"), [(0.0, 4), (0.7, 1), (0.7, 6), (1.0, 4)])
+@pytest.mark.slow
 def test_both_views_equal_the_slow_ones(lambda_: float, num_outputs: int) -> None:
     rates = np.array([0.2, 0.1])
     fast, slow = drawn(num_outputs), drawn(num_outputs)
@@ -235,6 +237,7 @@ def check_online_engines(lambda_: float, num_outputs: int, num_games: int, num_h
 
 
 @pytest.mark.parametrize(("lambda_", "num_outputs"), [(0.0, 1), (0.7, 4), (1.0, 6)])
+@pytest.mark.slow
 def test_torch_plays_and_learns_as_the_kernel_does(lambda_: float, num_outputs: int) -> None:
     check_online_engines(lambda_, num_outputs, 3, 6)
 
@@ -247,6 +250,7 @@ def test_torch_and_the_kernel_agree_after_200_games(lambda_: float, num_outputs:
 
 
 @pytest.mark.parametrize(("lambda_", "num_outputs"), [(0.0, 4), (0.7, 1), (0.7, 6), (1.0, 4)])
+@pytest.mark.slow
 def test_batches_in_torch_are_those_of_the_kernel(lambda_: float, num_outputs: int) -> None:
     net = drawn(num_outputs)
     values = TorchValues(net)
@@ -264,6 +268,7 @@ def test_batches_in_torch_are_those_of_the_kernel(lambda_: float, num_outputs: i
     assert worst(-found, total) < 1e-10 * max(1.0, np.abs(total).max())
 
 
+@pytest.mark.slow
 def test_steps_of_adam_in_torch_are_those_of_the_compiled_engine() -> None:
     settings = SelfPlaySettings(num_hidden=5, mode="batched", batch_games=2, step_size=0.01, dtype="float64")
     learner = SelfPlay(settings, seed=4)
@@ -320,6 +325,7 @@ def test_settings_that_would_be_ignored_are_refused() -> None:
 
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
 @pytest.mark.parametrize("mode", ["online", "batched"])
+@pytest.mark.slow
 def test_a_state_continues_bit_for_bit_and_does_not_change_under_the_feet(mode: str, engine: str) -> None:
     settings = SelfPlaySettings(num_hidden=4, mode=mode, engine=engine, batch_games=2, dtype="float64")
     learner = SelfPlay(settings, seed=5)
@@ -339,6 +345,7 @@ def test_a_state_continues_bit_for_bit_and_does_not_change_under_the_feet(mode: 
         SelfPlay(dataclasses.replace(settings, num_hidden=5), 0).load_state_dict(state)
 
 
+@pytest.mark.slow
 def test_two_threads_play_the_same_games_every_time() -> None:
     settings = SelfPlaySettings(num_hidden=4, mode="batched", batch_games=4, num_threads=2, dtype="float64")
     found = []

@@ -86,6 +86,7 @@ def slow_game(players: Sequence[Mover], first: int, dice: np.random.Generator) -
 
 
 @pytest.mark.parametrize("duplicate", [False, True])
+@pytest.mark.slow
 def test_match_is_that_of_the_slow_rules(duplicate: bool) -> None:
     played = play_match(A, BackgammonAgent(B), 6, 5, duplicate=duplicate)
     players = [one_ply(A), one_ply(B)]
@@ -199,6 +200,7 @@ def test_rates_are_counted_by_hand() -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_random_players_are_equals() -> None:
     played = play_match("random", "random", 1500, 1)
     assert abs(played.points_per_game) < 4 * played.standard_error < 0.25

@@ -59,6 +59,7 @@ def results() -> dict[str, object]:
     return {result.representation: result for result in run_baird(num_steps=1500)}
 
 
+@pytest.mark.slow
 def test_the_five_run_in_order_and_stay_finite(results: dict) -> None:  # type: ignore[type-arg]
     assert list(results) == ["table", "linear", "action-input", "separate", "action-output"]
     for result in results.values():

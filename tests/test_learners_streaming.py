@@ -387,7 +387,9 @@ FIELDS = ("s_tm1", "a_tm1", "mu_tm1", "r_t", "discount_t", "s_t", "last_t")
 
 
 @pytest.mark.parametrize("bound", [BOUNDS[0], *(pytest.param(bound, marks=pytest.mark.slow) for bound in BOUNDS[1:])])
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "conv" else name for name in NETWORKS]
+)
 def test_the_kernels_are_the_tensor_operations(name: str, bound: str) -> None:
     shape, body = NETWORKS[name]
     steps = [
