@@ -392,16 +392,16 @@ def points_against_random(net: ValueNetwork, num_games: int, rng: np.random.Gene
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_three_thousand_games_beat_random_play_by_far(seed: int) -> None:
-    """500 games give a standard error of about 0.05."""
+    """500 games give a standard error of about 0.05; weights as they are drawn come to between −0.2 and 1.6."""
     learner = SelfPlay(
         SelfPlaySettings(num_games=3000, num_hidden=40, lambda_=0.7, step_size=0.1, step_size_end=0.1), seed
     )
     learner.play(3000)
-    assert points_against_random(learner.network, 500, np.random.default_rng(seed)) > 1.0
+    assert points_against_random(learner.network, 500, np.random.default_rng(seed)) > 2.2
 
 
 @pytest.mark.slow
 def test_steps_in_the_wrong_direction_do_not() -> None:
     net = ValueNetwork.drawn(40, 4, np.random.default_rng(0))
     online(net, np.full(3000, -0.1), 0.7, np.random.default_rng(0))
-    assert points_against_random(net, 500, np.random.default_rng(0)) < 1.0
+    assert points_against_random(net, 500, np.random.default_rng(0)) < 1.9

@@ -106,7 +106,6 @@ LEARNED: dict[str, Any] = {
     "streaming, adaptive": replace(STREAMING, bound="adaptive-obgd"),
     "streaming, intentional": replace(STREAMING, bound="intentional", step_size=0.05),
     "gradient, qrc": GradientSettings(**GRADIENT),
-    "gradient, gq": GradientSettings(method="gq", **GRADIENT),
 }
 FAST = ("rollout, peng", "online, accumulating", "streaming, obgd")
 
