@@ -44,6 +44,7 @@ def _batch(seed: int, *lead: int, dtype: torch.dtype = torch.float32) -> Transit
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("layout", [ActionInputQ, SeparateQ, ActionOutputQ])
+@pytest.mark.slow
 def test_values_and_gradients_are_those_of_tensors(layout: Any, dtype: torch.dtype) -> None:
     engine, t = _engine(layout, dtype), _batch(0, B, dtype=dtype)
     engine.sync_target()

@@ -295,6 +295,7 @@ def test_tesauros_units_by_hand() -> None:
     assert x.tolist() == expected.tolist()
 
 
+@pytest.mark.slow
 def test_a_random_player_plays_to_the_end_and_both_sides_win_equally_often() -> None:
     out, rng = np.empty((MAX_AFTERSTATES, 2, 25), np.int8), np.random.default_rng(6)
     games = np.array([random_game(START, rng, out) for _ in range(4000)])

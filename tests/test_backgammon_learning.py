@@ -169,20 +169,21 @@ def test_one_game_from_weights_of_zero_is_hand_arithmetic(lambda_: float) -> Non
     """All values are ½ and only the last turn is a surprise, of ½. So with s = ±1 for whoever moved first or second,
     the bias gets Σₜ λ^(T−1−t) · ½ · s_T s_t · ¼ = ⅛ (1 − (−λ)^T) / (1 + λ), and v half of that, for h = ½."""
     for seed in range(4):
-        net = ValueNetwork(1, 1, np.float64)
+        net = ValueNetwork(1, 1)
         grad, tally = batch(net, 1, lambda_, np.random.default_rng(seed))
         expected = (1 - (-lambda_) ** int(tally[3])) / (1 + lambda_) / 8
-        assert grad[-2:] == pytest.approx([expected / 2, expected], abs=1e-15) and not grad[:-2].any()
+        assert grad[-2:] == pytest.approx([expected / 2, expected], abs=1e-7) and not grad[:-2].any()
         online(net, np.array([0.01]), lambda_, np.random.default_rng(seed))  # in the first player's view throughout
-        assert net.flat[-2:] == pytest.approx([0.01 * expected / 2, 0.01 * expected], abs=1e-16)
-        four = ValueNetwork(1, 4, np.float64)
+        assert net.flat[-2:] == pytest.approx([0.01 * expected / 2, 0.01 * expected], abs=1e-8)
+        four = ValueNetwork(1, 4)
         grad, tally = batch(four, 1, 0.0, np.random.default_rng(seed))
         won = slow_outcome(1 + int(np.argmax(tally[:3])), 4)
-        assert grad[-4:] == pytest.approx((won - 0.5) / 4, abs=1e-15)
+        assert grad[-4:] == pytest.approx((won - 0.5) / 4, abs=1e-7)
 
 
 @pytest.mark.parametrize("num_outputs", [1, 4])
 @pytest.mark.parametrize("lambda_", [0.0, 0.6, 1.0])
+@pytest.mark.slow
 def test_the_backward_view_is_the_forward_view_when_steps_are_small(lambda_: float, num_outputs: int) -> None:
     before, net, small = drawn(num_outputs), drawn(num_outputs), 1e-7
     grad, _ = batch(net, 3, lambda_, np.random.default_rng(7))

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.slow
 def test_bench_exact_prints_ratios_and_one_json_object() -> None:
     for package in ("quantecon", "mdptoolbox"):
         pytest.importorskip(package, reason="the bench extra is not installed")

@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_bench_replay_prints_a_table_and_one_json_object() -> None:
     pytest.importorskip("stable_baselines3", reason="the bench extra is not installed")
     command = [sys.executable, "scripts/bench_replay.py", "--capacity=100", "--rounds=1", "--seconds=0.001", "--json"]

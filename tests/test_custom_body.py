@@ -192,6 +192,7 @@ def test_from_the_command_line_in_the_folder_where_it_lies(tmp_path: Path, monke
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_replay_and_pictures_take_it_too(tmp_path: Path) -> None:
     settings = ReplaySettings(learning_starts=20, batch_size=8, train_period=8)
     config = RunConfig(env="FrozenLake-v1", learner="replay", replay=settings, body=TOWER, total_steps=64)

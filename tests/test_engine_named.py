@@ -31,7 +31,18 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("config", "name"), CASES, ids=[f"{c.learner} {c.layout} {n}" for c, n in CASES])
+def is_slow(config: RunConfig, name: str) -> bool:
+    """Streaming kernels take seconds to compile."""
+    return config.learner == "streaming" and name == "compiled"
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        pytest.param(c, n, id=f"{c.learner} {c.layout} {n}", marks=[pytest.mark.slow] if is_slow(c, n) else [])
+        for c, n in CASES
+    ],
+)
 def test_the_engine_is_named(config: RunConfig, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "is_resumable", lambda *_: Resumability(False, "not asked"))
     session = build_session(config)

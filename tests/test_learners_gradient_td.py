@@ -223,6 +223,7 @@ def control_star() -> tuple[Array, Array, Array]:
     return phi, theta, np.tile([1 / 49, 6 / 49], (7, 1))
 
 
+@pytest.mark.slow
 def test_greedy_gq_on_bairds_control_star() -> None:
     phi, theta, d = control_star()
     engine = TorchEngine(FeatureQ(phi), Loss())

@@ -107,7 +107,7 @@ LEARNED: dict[str, Any] = {
     "streaming, intentional": replace(STREAMING, bound="intentional", step_size=0.05),
     "gradient, qrc": GradientSettings(**GRADIENT),
 }
-FAST = ("rollout, peng", "online, accumulating", "streaming, obgd")
+FAST = ("rollout, peng", "online, accumulating")
 
 
 def learned(name: str, mistake: str | None) -> Any:

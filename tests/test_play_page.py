@@ -166,6 +166,7 @@ def test_a_whole_game_is_played_by_clicking(page: Any, table: str) -> None:
     assert not is_over(page) and scores(page) == won
 
 
+@pytest.mark.slow
 def test_the_end_of_a_game_is_played_by_clicking(page: Any, table: str) -> None:
     page.goto(f"{table}?seed=11")
     wait_until(lambda: revision(page) > 0)

@@ -111,6 +111,7 @@ SLOW = (
     "replay, one-step",
     "online, table",
     "gq, linear",
+    "qrc, network",
 )
 
 
