@@ -29,6 +29,7 @@ from neuralq.learners.average import played_parameters, playing
 from neuralq.learners.update import Learner, Update
 from neuralq.record import RunFolder
 from neuralq.snapshot import Resumability, encode_env, restore_env
+from neuralq.stopwatch import Stopwatch
 from neuralq.types import Transition
 
 __all__ = ["Diverged", "Hook", "Onlooker", "Plan", "Progress", "Session", "StopRequest", "fit", "restore", "seed_for"]
@@ -231,23 +232,13 @@ class _Loop:
         self.last_update: Update | None = None
         self.last_sample: Sample | None = None
         self.device = session.learner.engine.flat.values.device
-        self._reset_clock()
+        self._clock = Stopwatch(progress)
         self._log_clock = (progress.env_steps, time.perf_counter())
         progress.finished = False
         progress.interrupted_by = None
         for name, period in (("evaluation", plan.evaluate_every), ("checkpoint", plan.checkpoint_every)):
             if getattr(progress, f"next_{name}") == 0:
                 setattr(progress, f"next_{name}", period)
-
-    def _reset_clock(self) -> None:
-        self._cpu, self._wall = time.process_time(), time.perf_counter()
-
-    def _stop_clock(self, training: bool = True) -> None:
-        """Book the time since the clock was last read; evaluation counts as wall time only."""
-        if training:
-            self.progress.cpu_seconds += time.process_time() - self._cpu
-        self.progress.wall_seconds += time.perf_counter() - self._wall
-        self._reset_clock()
 
     def run(self, request: StopRequest) -> None:
         session, plan, progress = self.session, self.plan, self.progress
@@ -270,7 +261,7 @@ class _Loop:
                 self._save()
         if progress.evaluated_at != progress.env_steps:
             self._evaluate()
-        self._stop_clock()
+        self._clock.read()
         progress.finished = True
         self._save()
 
@@ -299,14 +290,14 @@ class _Loop:
             if self.last_sample is not None and isinstance(hook, Onlooker):
                 hook.look(self.session.learner, self.last_sample)
             hook(row)
-        self._stop_clock(training=False)  # whoever watches costs wall time only
+        self._clock.read(training=False)  # whoever watches costs wall time only
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed."""
         return self.progress.last_metrics if self.last_update is None else self.last_update.metrics()
 
     def _log(self) -> None:
-        self._stop_clock()
+        self._clock.read()
         progress = self.progress
         progress.next_log = progress.env_steps + self.plan.log_every
         then, now = self._log_clock, (progress.env_steps, time.perf_counter())
@@ -323,7 +314,7 @@ class _Loop:
         self._record(row | self._last_metrics())
 
     def _evaluate(self) -> None:
-        self._stop_clock()
+        self._clock.read()
         session, plan, progress = self.session, self.plan, self.progress
         progress.next_evaluation = (progress.env_steps // plan.evaluate_every + 1) * plan.evaluate_every
         progress.evaluated_at = progress.env_steps
@@ -336,7 +327,7 @@ class _Loop:
             keep_best(self.folder.path, progress.env_steps, result.mean, played_parameters(session.learner), seen)
         if plan.stop_at_return is not None and progress.reached_at is None and result.mean >= plan.stop_at_return:
             progress.reached_at = progress.env_steps
-        self._stop_clock(training=False)
+        self._clock.read(training=False)
         self._record(
             {
                 "kind": "evaluation",
@@ -356,7 +347,7 @@ class _Loop:
         period = self.plan.checkpoint_every
         progress.next_checkpoint = (progress.env_steps // period + 1) * period
         _refuse_divergence(self.session, progress)
-        self._stop_clock()
+        self._clock.read()
         checkpoint.save(self.folder.checkpoints_path, progress.env_steps, _state(self.session, progress))
 
 

@@ -37,14 +37,13 @@ from neuralq.backgammon import (
     SelfPlaySettings,
     ValueNetwork,
     kernels,
-    learning_kernels,
     torch_engine,
 )
 from neuralq.backgammon.network import equities
 from neuralq.backgammon.torch_engine import TorchBatch, TorchValues
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.inputs import tesauro_dense
-from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates, result
+from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates, result, roll
 
 # Values and choices.
 
@@ -193,14 +192,12 @@ def test_the_backward_view_is_the_forward_view_when_steps_are_small(lambda_: flo
 
 def test_the_opening_roll_is_no_double() -> None:
     rng = np.random.default_rng(0)
-    openings = [learning_kernels._roll(rng, True) for _ in range(3000)]
-    later = [learning_kernels._roll(rng, False) for _ in range(3000)]
+    openings = [roll(rng, True) for _ in range(3000)]
+    later = [roll(rng, False) for _ in range(3000)]
     assert len(set(openings)) == 30 and all(a != b for a, b in openings)
     assert len(set(later)) == 36 and abs(sum(a == b for a, b in later) / 3000 - 1 / 6) < 5 * np.sqrt(5 / 36 / 3000)
     rng_a, rng_b = np.random.default_rng(1), np.random.default_rng(1)
-    assert [learning_kernels._roll(rng_a, i % 3 == 0) for i in range(300)] == [
-        slow_roll(rng_b, i % 3 == 0) for i in range(300)
-    ]
+    assert [roll(rng_a, i % 3 == 0) for i in range(300)] == [slow_roll(rng_b, i % 3 == 0) for i in range(300)]
 
 
 # The torch engine.

@@ -167,7 +167,7 @@ def test_games_have_dice_of_their_own_and_begin_without_a_double(monkeypatch: py
 
 def test_compiled_dice_are_those_of_asked_players() -> None:
     drawn, other = match.rolls(np.random.default_rng(9)), np.random.default_rng(9)
-    assert [next(drawn) for _ in range(300)] == [match._roll(other, i == 0) for i in range(300)]
+    assert [next(drawn) for _ in range(300)] == [match.roll(other, i == 0) for i in range(300)]
 
 
 def test_a_player_gets_nothing_from_itself_with_duplicate_dice() -> None:

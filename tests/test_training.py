@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from neuralq import checkpoint, training
+from neuralq import checkpoint, stopwatch, training
 from neuralq.evaluation import Evaluation
 from neuralq.learners import OnlineSettings, RolloutSettings
 from neuralq.recipes import RunConfig, train
@@ -114,7 +114,8 @@ def test_evaluation_counts_as_wall_time_but_not_as_training(tmp_path: Path, monk
         now[0] += 0.001
         return now[0]
 
-    monkeypatch.setattr(training, "time", SimpleNamespace(process_time=tick, perf_counter=tick))
+    for module in (training, stopwatch):
+        monkeypatch.setattr(module, "time", SimpleNamespace(process_time=tick, perf_counter=tick))
     monkeypatch.setattr(training.Session, "evaluate", slow_evaluation)
     run = train(corridor(), tmp_path / "run")
     assert run.cpu_seconds < 1.0 and 400.0 < run.wall_seconds < 401.0

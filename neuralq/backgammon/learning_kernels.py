@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neuralq.backgammon.kernels import Scratch, choose, forward, settled
 from neuralq.jit import kernel, lean_kernel, lean_reassociating_kernel
-from neuralq_envs.backgammon.rules import START, Board, afterstates, result
+from neuralq_envs.backgammon.rules import START, Board, afterstates, copy_board, result, roll
 
 __all__ = ["play_batch", "play_online"]
 
@@ -27,28 +27,12 @@ _NEGLIGIBLE = 1e-12
 _FIRST_HISTORY = 512
 
 
-@lean_kernel
-def _roll(rng: np.random.Generator, opening: bool) -> tuple[int, int]:
-    """Two dice; the opening roll is no double."""
-    while True:
-        die_1, die_2 = 1 + int(6 * rng.random()), 1 + int(6 * rng.random())
-        if die_1 != die_2 or not opening:
-            return die_1, die_2
-
-
-@lean_kernel
-def _copy(board: Board, to: Board) -> None:
-    for side in range(2):
-        for point in range(25):
-            to[side, point] = board[side, point]
-
-
 @kernel
 def _turn(board: Board, opening: bool, rng: np.random.Generator, w: _Array, v: _Array, c: _Array, s: Scratch) -> None:
     """Rolls and plays the best turn, in place: the board is then seen by the other side."""
-    die_1, die_2 = _roll(rng, opening)
+    die_1, die_2 = roll(rng, opening)
     count = afterstates(board, die_1, die_2, s.boards)
-    _copy(s.boards[choose(count, w, v, c, s) if count > 1 else 0], board)
+    copy_board(s.boards[choose(count, w, v, c, s) if count > 1 else 0], board)
 
 
 @lean_kernel
@@ -195,7 +179,7 @@ def play_online(
     for game in range(len(rates)):
         rate, decay = dtype.type(rates[game]), dtype.type(lambdas[game])
         oldest = _oldest_trace(lambdas[game])
-        _copy(START, board)
+        copy_board(START, board)
         _forget(zw, zv, zc, ages)
         turns, points = 0, 0
         num_rows: Any = np.int64(0)  # a literal 0 would have `_remember` compiled twice
@@ -251,15 +235,15 @@ def play_batch(
     board = np.empty((2, 25), np.int8)
     some, rest = w.dtype.type(lambda_), w.dtype.type(1.0 - lambda_)
     for _ in range(num_games):
-        _copy(START, board)
+        copy_board(START, board)
         turns, points = 0, 0
         while points == 0:
             if turns == len(history):
                 longer = np.empty((2 * turns, 2, 25), np.int8)
                 for t in range(turns):  # numba takes 3 s to compile `longer[:turns] = history`
-                    _copy(history[t], longer[t])
+                    copy_board(history[t], longer[t])
                 history = longer
-            _copy(board, history[turns])
+            copy_board(board, history[turns])
             _turn(board, turns == 0, rng, w, v, c, s)
             turns += 1
             points = result(board)

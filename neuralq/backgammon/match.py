@@ -30,7 +30,7 @@ from neuralq.backgammon.opponents import GnubgPlayer, require_gnubg
 from neuralq.backgammon.search import choose_two_ply
 from neuralq.checks import check_choice, check_whole
 from neuralq.jit import kernel
-from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, Board, afterstates, result
+from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, Board, afterstates, copy_board, result, roll
 
 __all__ = ["OPPONENTS", "MatchResult", "Player", "Side", "play_match", "rolls", "turn_taker"]
 
@@ -315,14 +315,6 @@ def rolls(dice: np.random.Generator) -> Iterator[tuple[int, int]]:
 
 
 @kernel
-def _roll(dice: np.random.Generator, opening: bool) -> tuple[int, int]:
-    while True:
-        die_1, die_2 = 1 + int(6 * dice.random()), 1 + int(6 * dice.random())
-        if die_1 != die_2 or not opening:
-            return die_1, die_2
-
-
-@kernel
 def _take_turn(
     board: Board, die_1: int, die_2: int, plies: int, lot: float, w: _Array, v: _Array, c: _Array, s: Scratch
 ) -> None:
@@ -336,9 +328,7 @@ def _take_turn(
         best = choose(count, w, v, c, s)
     else:
         best = choose_two_ply(count, w, v, c, s)
-    for side in range(2):
-        for point in range(25):
-            board[side, point] = s.boards[best, side, point]
+    copy_board(s.boards[best], board)
 
 
 @kernel
@@ -350,7 +340,7 @@ def _play_game(
     board = START.copy()
     mover, turns, points = first, 0, 0
     while points == 0:
-        die_1, die_2 = _roll(dice, turns == 0)
+        die_1, die_2 = roll(dice, turns == 0)
         plies = plies_0 if mover == 0 else plies_1
         lot = choices.random() if plies == 0 else 0.0
         if mover == 0:

@@ -30,6 +30,7 @@ from neuralq.backgammon.network import ValueNetwork
 from neuralq.backgammon.opponents import require_gnubg
 from neuralq.backgammon.selfplay import SelfPlay
 from neuralq.record import RunFolder, RunFolderError, default_run_path, is_run_folder, read_config, refuse_old_run
+from neuralq.stopwatch import Stopwatch
 from neuralq.training import Diverged, Hook, StopRequest, seed_for
 
 __all__ = [
@@ -220,7 +221,7 @@ class _Loop:
         progress.next_log = progress.next_log or config.log_every
         progress.next_evaluation = progress.next_evaluation or config.evaluate_every
         progress.next_checkpoint = progress.next_checkpoint or config.checkpoint_every
-        self._reset_clock()
+        self._clock = Stopwatch(progress)
         self._log_clock = (learner.num_games, time.perf_counter())
 
     def run(self) -> GammonRun:
@@ -253,16 +254,6 @@ class _Loop:
         progress.finished = True
         self._save()
 
-    def _reset_clock(self) -> None:
-        self._cpu, self._wall = time.process_time(), time.perf_counter()
-
-    def _stop_clock(self, training: bool = True) -> None:
-        """Book the time since the clock was last read; evaluation counts as wall time only."""
-        if training:
-            self.progress.cpu_seconds += time.process_time() - self._cpu
-        self.progress.wall_seconds += time.perf_counter() - self._wall
-        self._reset_clock()
-
     def _row(self, kind: str) -> dict[str, Any]:
         return {
             "kind": kind,
@@ -276,13 +267,13 @@ class _Loop:
         self.folder.append_metrics(row)
         for hook in self.hooks:
             hook(row)
-        self._stop_clock(training=False)  # whoever watches costs wall time only
+        self._clock.read(training=False)  # whoever watches costs wall time only
 
     def _after(self, period: int) -> int:
         return (self.learner.num_games // period + 1) * period
 
     def _log(self) -> None:
-        self._stop_clock()
+        self._clock.read()
         learner, progress = self.learner, self.progress
         self._refuse_divergence()
         progress.next_log = self._after(self.config.log_every)
@@ -303,7 +294,7 @@ class _Loop:
         )
 
     def _evaluate(self) -> None:
-        self._stop_clock()
+        self._clock.read()
         config, progress, learner = self.config, self.progress, self.learner
         self._refuse_divergence()
         progress.next_evaluation = self._after(config.evaluate_every)
@@ -318,7 +309,7 @@ class _Loop:
             progress.points[opponent] = (result.points_per_game, result.standard_error)
             row[f"ppg_{opponent}"], row[f"ppg_{opponent}_standard_error"] = progress.points[opponent]
             row[f"win_rate_{opponent}"], row[f"gammon_rate_{opponent}"] = result.win_rate, result.gammon_rate
-        self._stop_clock(training=False)
+        self._clock.read(training=False)
         self._log_clock = (learner.num_games, time.perf_counter())
         self._record({**self._row("evaluation"), **row})
 
@@ -333,7 +324,7 @@ class _Loop:
         progress, learner = self.progress, self.learner
         progress.next_checkpoint = self._after(self.config.checkpoint_every)
         self._refuse_divergence()
-        self._stop_clock()
+        self._clock.read()
         state = {"progress": dataclasses.asdict(progress), "learner": learner.state_dict()}
         checkpoint.save(self.folder.checkpoints_path, int(learner.tally[3]), state)
 

@@ -34,10 +34,12 @@ __all__ = [
     "START",
     "Board",
     "afterstates",
+    "copy_board",
     "is_legal",
     "play",
     "random_game",
     "result",
+    "roll",
     "take_back",
 ]
 
@@ -132,7 +134,15 @@ def take_back(board: Board, source: int, die: int, hit: bool) -> None:
 
 
 @lean_kernel
-def _copy(board: Board, to: Board) -> None:
+def copy_board(board: Board, to: Board) -> None:
+    """Writes ``board`` over ``to``, both ``[2, 25]``.
+
+    Example:
+        >>> board = np.zeros((2, 25), np.int8)
+        >>> copy_board(START, board)
+        >>> (board == START).all().item()
+        True
+    """
     for point in range(25):
         to[0, point] = board[0, point]
         to[1, point] = board[1, point]
@@ -248,7 +258,7 @@ def afterstates(board: Board, die_1: int, die_2: int, out: Board) -> int:
         [15, 7, 42]
     """
     work = np.empty((2, 25), np.int8)
-    _copy(board, work)
+    copy_board(board, work)
     if die_1 == die_2:
         count = _play_double(work, die_1, out)
     else:
@@ -299,6 +309,21 @@ def result(board: Board) -> int:
     return 0
 
 
+@lean_kernel
+def roll(rng: np.random.Generator, opening: bool) -> tuple[int, int]:
+    """Two dice; the opening roll of a game is no double.
+
+    Example:
+        >>> rng = np.random.default_rng(2)
+        >>> [roll(rng, opening=number == 0) for number in range(4)]
+        [(5, 1), (4, 5), (2, 1), (2, 4)]
+    """
+    while True:
+        die_1, die_2 = 1 + int(6 * rng.random()), 1 + int(6 * rng.random())
+        if die_1 != die_2 or not opening:
+            return die_1, die_2
+
+
 @kernel
 def random_game(board: Board, rng: np.random.Generator, out: Board) -> tuple[int, int, int]:
     """Plays to the end, both sides choosing among afterstates with equal chances; the first roll may be a double.
@@ -318,10 +343,10 @@ def random_game(board: Board, rng: np.random.Generator, out: Board) -> tuple[int
         (True, True)
     """
     now, turns, seen = np.empty((2, 25), np.int8), 0, 0
-    _copy(board, now)
+    copy_board(board, now)
     while result(now) == 0:
         count = afterstates(now, 1 + int(6 * rng.random()), 1 + int(6 * rng.random()), out)
-        _copy(out[int(count * rng.random())], now)
+        copy_board(out[int(count * rng.random())], now)
         turns += 1
         seen += count
     return (result(now) if turns % 2 == 0 else -result(now)), turns, seen
