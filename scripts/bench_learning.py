@@ -1,21 +1,23 @@
 """What the rollout learner comes to with its presets: final greedy return over seeds, one row per environment.
 
-    python scripts/bench_learning.py [CartPole-v1 ...] [--seeds 10] [--first-seed 1100] [--json]
+    python scripts/bench_learning.py [CartPole-v1 ...] [--seeds 10] [--first-seed 1100] [--runs FOLDER] [--json]
 
-LunarLander-v3, which needs the extra box2d, is measured when it is named. Every seed trains with the preset and its
-budget of steps on one thread. The final return is the mean of 100 greedy episodes, none of them seen before, of the
-agent that the run leaves behind; the row gives the interquartile mean over seeds with its stratified bootstrap
-interval. A seed is solved at its first evaluation (20 greedy episodes) that averages at least the threshold, and stays
-if the next three do as well. CPU-seconds are those of training. Example:
+LunarLander-v3, which needs the extra box2d, and the games of MinAtar, which need the extra minatar, are measured when
+they are named. Every seed trains with the preset and its budget of steps on one thread. The final return is the mean
+of 100 greedy episodes, none of them seen before, of the agent that the run leaves behind; the row gives the
+interquartile mean over seeds with its stratified bootstrap interval. A seed is solved at its first evaluation (20
+greedy episodes) that averages at least the threshold, and stays if the next three do as well; in MinAtar the threshold
+is where DQN's published curve ends, and Seaquest has none, for its curve is from before a mistake in the game was
+mended. CPU-seconds are those of training. Example:
 
     CartPole-v1, 100,000 steps
     seed     final   solved at   CPU-s   next three
     1000     500.0       8,583    0.45   500 500 500  stays
        …
-    environment       steps      final   interval 95 %        solved   stay   until solved     in all
-    CartPole-v1     100,000      500.0    500.0 .. 500.0       10/10   9/10   0.45 CPU-s    4.1 CPU-s
+    environment                  steps      final      interval 95 %     solved   stay   until solved        in all
+    CartPole-v1                100,000      500.0     500.0 .. 500.0      10/10   9/10     0.45 CPU-s     4.1 CPU-s
 
-``--json`` prints one JSON object as the last line, with the same numbers.
+``--json`` prints one JSON object as the last line, with the same numbers; ``--runs`` keeps the runs, for their curves.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import math
 import multiprocessing
 import statistics
 import tempfile
@@ -36,17 +39,28 @@ from neuralq.aggregate import estimate
 from neuralq.recipes import evaluate_run, with_preset
 from neuralq.record import read_metrics
 
-THRESHOLDS = {"CartPole-v1": 475.0, "Acrobot-v1": -100.0, "MountainCar-v0": -110.0, "LunarLander-v3": 200.0}
+THRESHOLDS: dict[str, float | None] = {
+    "CartPole-v1": 475.0,
+    "Acrobot-v1": -100.0,
+    "MountainCar-v0": -110.0,
+    "LunarLander-v3": 200.0,
+    # DQN after 5,000,000 frames, read off the curves of the games' authors (Young & Tian 2019, README; 30 seeds).
+    "MinAtar/Asterix-v1": 17.0,
+    "MinAtar/Breakout-v1": 10.0,
+    "MinAtar/Freeway-v1": 50.0,
+    "MinAtar/Seaquest-v1": None,
+    "MinAtar/SpaceInvaders-v1": 44.0,
+}
 DEFAULT = ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")  # those that need no extra
 NUM_AFTER = 3
 
 
-def learn(case: tuple[str, int], total_steps: int | None, num_episodes: int) -> dict[str, Any]:
+def learn(case: tuple[str, int], total_steps: int | None, num_episodes: int, runs: Path | None) -> dict[str, Any]:
     env, seed = case
     given = {} if total_steps is None else {"total_steps": total_steps}
     config = with_preset({"env": env, "seed": seed, "checkpoint_every": 10**9, **given})
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "run")
+        path = Path(runs or folder, f"{env.replace('/', '-')}-{seed}")
         run = neuralq.train(config, path)
         final = evaluate_run(path, num_episodes).mean
         rows = [row for row in read_metrics(path) if row["kind"] == "evaluation"]
@@ -54,9 +68,10 @@ def learn(case: tuple[str, int], total_steps: int | None, num_episodes: int) -> 
     return outcome | first_hit(rows, THRESHOLDS[env])
 
 
-def first_hit(rows: Sequence[dict[str, Any]], threshold: float) -> dict[str, Any]:
+def first_hit(rows: Sequence[dict[str, Any]], threshold: float | None) -> dict[str, Any]:
     """Where the evaluations ``rows`` first reach the threshold, and whether the next three do too."""
-    hit = next((i for i, row in enumerate(rows) if row["greedy_return"] >= threshold), None)
+    goal = math.inf if threshold is None else threshold
+    hit = next((i for i, row in enumerate(rows) if row["greedy_return"] >= goal), None)
     if hit is None:
         return {"solved_at": None, "solved_cpu_seconds": None, "next_returns": [], "stays": False}
     following = [row["greedy_return"] for row in rows[hit + 1 : hit + 1 + NUM_AFTER]]
@@ -64,7 +79,7 @@ def first_hit(rows: Sequence[dict[str, Any]], threshold: float) -> dict[str, Any
         "solved_at": rows[hit]["env_steps"],
         "solved_cpu_seconds": rows[hit]["cpu_seconds"],
         "next_returns": following,
-        "stays": len(following) == NUM_AFTER and min(following) >= threshold,
+        "stays": len(following) == NUM_AFTER and min(following) >= goal,
     }
 
 
@@ -81,7 +96,7 @@ def in_processes(
 def seed_row(result: dict[str, Any]) -> str:
     line = f"{result['seed']:>4} {result['final_return']:>9.1f} "
     if result["solved_at"] is None:
-        return line + f"{'-':>11} {'-':>7}   never at the threshold"
+        return line + f"{'-':>11} {'-':>7}   not at a threshold"
     returns = " ".join(f"{value:.0f}" for value in result["next_returns"])
     verdict = "stays" if result["stays"] else "falls below" if len(result["next_returns"]) == NUM_AFTER else "ends"
     return line + f"{result['solved_at']:>11,} {result['solved_cpu_seconds']:>7.2f}   {returns}  {verdict}"
@@ -111,7 +126,7 @@ def summary_row(row: dict[str, Any]) -> str:
     until = "-" if row["median_solved_cpu_seconds"] is None else f"{row['median_solved_cpu_seconds']:.2f} CPU-s"
     solved, stay = (f"{row[name]}/{row['num_seeds']}" for name in ("num_solved", "num_stay"))
     return (
-        f"{row['env']:<15} {row['env_steps']:>8,} {row['iqm']:>10.1f} {interval:>18} "
+        f"{row['env']:<24} {row['env_steps']:>9,} {row['iqm']:>10.1f} {interval:>18} "
         f"{solved:>10} {stay:>6} {until:>14} {row['median_cpu_seconds']:>7.1f} CPU-s"
     )
 
@@ -124,12 +139,13 @@ def main() -> None:
     parser.add_argument("--total-steps", type=int, help="environment steps in place of the preset's")
     parser.add_argument("--episodes", type=int, default=100, help="of the final evaluation (default 100)")
     parser.add_argument("--processes", type=int, default=2, help="seeds at a time (default 2)")
+    parser.add_argument("--runs", type=Path, help="a folder for the runs, which else are not kept")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     options = parser.parse_args()
     if unknown := [env for env in options.envs if env not in THRESHOLDS]:
         parser.error(f"no threshold for {', '.join(unknown)}; choose from {', '.join(THRESHOLDS)}")
 
-    one = functools.partial(learn, total_steps=options.total_steps, num_episodes=options.episodes)
+    one = functools.partial(learn, total_steps=options.total_steps, num_episodes=options.episodes, runs=options.runs)
     summaries = []
     for env in options.envs or DEFAULT:
         cases = [(env, options.first_seed + i) for i in range(options.seeds)]
@@ -140,7 +156,7 @@ def main() -> None:
             print(seed_row(result), flush=True)
         summaries.append(summary_of(env, results))
     header = ("environment", "steps", "final", "interval 95 %", "solved", "stay", "until solved", "in all")
-    print("{:<15} {:>8} {:>10} {:>18} {:>10} {:>6} {:>14} {:>13}".format(*header))
+    print("{:<24} {:>9} {:>10} {:>18} {:>10} {:>6} {:>14} {:>13}".format(*header))
     for summary in summaries:
         print(summary_row(summary))
     if options.json:
