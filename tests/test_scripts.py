@@ -211,3 +211,34 @@ def test_td_gammon_curve_has_a_row_for_each_evaluation_and_opponent(
     first = figure.read_text()
     run(monkeypatch, capsys, "td_gammon_curve.py", f"--draw={table}", f"--svg={figure}")
     assert figure.read_text() == first and "against pubeval" not in first  # letters are drawn as paths
+
+
+def test_learning_curves_has_a_panel_for_each_environment_and_a_mean_over_its_seeds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    runs = []
+    for env, seed, returns in (("A/One-v1", 1, [2.0, 4.0]), ("A/One-v1", 2, [4.0, 6.0, 9.0]), ("Two-v0", 1, [-3.0])):
+        with RunFolder.create(tmp_path / f"{env[-6]}{seed}", config={"env": env, "seed": seed}, seed=seed) as folder:
+            folder.append_metrics({"kind": "train", "env_steps": 50})
+            for i, greedy in enumerate(returns, 1):
+                row: dict[str, float | str] = {"kind": "evaluation", "env_steps": 100 * i, "cpu_seconds": 1.26 * i}
+                folder.append_metrics({**row, "greedy_return": greedy})
+        runs.append(str(folder.path))
+    table, figure, level = tmp_path / "curves.csv", tmp_path / "curves.svg", "--level=Two-v0=-1"
+    lines = run(monkeypatch, capsys, "learning_curves.py", *runs, level, f"--csv={table}", f"--svg={figure}")
+    assert [line.split()[-1] for line in lines] == ["9.0", "-3.0"]  # of one seed where the other has not come so far
+    rows = table.read_text().splitlines()
+    assert len(rows) == 1 + 6 and rows[1:3] == ["A/One-v1,1,100,1.3,2.0", "A/One-v1,1,200,2.5,4.0"]
+    first = figure.read_text()
+    run(monkeypatch, capsys, "learning_curves.py", f"--draw={table}", level, f"--svg={figure}")
+    assert figure.read_text() == first
+    run(monkeypatch, capsys, "learning_curves.py", f"--draw={table}", f"--svg={figure}")
+    assert figure.read_text() != first, "the level is drawn"
+    steps, means = runpy.run_path(str(ROOT / "scripts" / "learning_curves.py"))["mean_curve"](
+        [
+            {"env_steps": 2, "greedy_return": 1.0},
+            {"env_steps": 1, "greedy_return": 3.0},
+            {"env_steps": 2, "greedy_return": 2.0},
+        ]
+    )
+    assert (steps, means) == ([1, 2], [3.0, 1.5])
