@@ -278,11 +278,13 @@ class _Loop:
         self.progress.env_steps = session.stream.num_steps
 
     def _on_device(self, sample: Sample) -> tuple[Transition, Tensor | None]:
-        """The sample where the learner computes; on the CPU it stays where it is."""
+        """The sample where the learner computes; on the CPU it stays where it is.
+
+        Weights stay on the host: which of them are 0 is asked there, and learners that multiply by them move them.
+        """
         if self.device.type == "cpu":
             return sample.transition, sample.weight
-        weight = None if sample.weight is None else sample.weight.to(self.device)
-        return sample.transition.map(lambda x: x.to(self.device)), weight
+        return sample.transition.map(lambda x: x.to(self.device)), sample.weight
 
     def _record(self, row: dict[str, Any]) -> None:
         self.folder.append_metrics(row)

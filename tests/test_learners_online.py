@@ -194,7 +194,7 @@ def test_the_learner_with_its_own_drop_taken_out_fails(monkeypatch: pytest.Monke
     t = stream("linear", engine, "truncation")
     learner = OnlineLearner(engine, settings())
     close = learner._core.traces.close
-    monkeypatch.setattr(learner._core.traces, "close", lambda lane, d, v, last: close(lane, d, v, False))
+    monkeypatch.setattr(learner._core.traces, "close", lambda lane, d, v, last: close(lane, d, v, last & False))
     assert float((frozen_sum(learner, t) - forward(t, copy.deepcopy(engine.q))).abs().max()) > 1e-3
 
 

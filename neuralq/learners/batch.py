@@ -115,6 +115,7 @@ class ReplayLearner:
             return self._update_arrays(arrays, None if weight is None else weight.to(transition.r_t.dtype).numpy())
         targets = self.targets(transition)
         s, a = transition.s_tm1, transition.a_tm1
+        weight = None if weight is None else weight.to(targets.device)
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)

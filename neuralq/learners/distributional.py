@@ -104,7 +104,7 @@ class DistributionalLearner:
             each, aim = rules.quantile_huber(outputs, targets), targets.mean(-1)
         if weight is not None:
             check_same_shape("weight", weight, "r_t", transition.r_t)
-            each = each * weight.to(each.dtype)
+            each = each * weight.to(each)
         each.mean().backward()  # type: ignore[no-untyped-call]
         errors = aim - distribution.mean(outputs.detach())
         self._descent.follow()

@@ -176,6 +176,7 @@ class DQRCLearner:
         regression = rules.squared(delta - h)
         if weight is not None:
             check_same_shape("weight", weight, "r_t", transition.r_t)
+            weight = weight.to(delta.device)
             corrected, regression = corrected * weight, regression * weight
         grad = gradient(corrected.mean(), self._parameters)
         grad_h = gradient(regression.mean(), self._parameters_h) + self.settings.beta * self._correction.values

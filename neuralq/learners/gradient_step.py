@@ -168,7 +168,7 @@ class GradientStep:
     ) -> tuple[Tensor, Tensor, Update]:
         """What to add to the values ``[d]`` and to h ``[k]``; the traces move on."""
         self.traces.check(len(seen.q))
-        weight = torch.ones_like(seen.target) if weight is None else weight.to(seen.target.dtype)
+        weight = torch.ones_like(seen.target) if weight is None else weight.to(seen.target)
         moved = weight != 0
         delta = seen.target - seen.q.detach()
         grad = gradient_rows(seen.q, self.parameters)

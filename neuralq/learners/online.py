@@ -88,15 +88,14 @@ class _Traces:
         v_old = self.v_old[lane, output]
         return rules.true_online_increment(z, grad, delta, v_tm1, v_old, self.settings.step_size)
 
-    def close(self, lane: int, discount_t: Tensor, v_t: Tensor, last: bool) -> None:
-        """Remember the discount into the next state; drop everything after the last step of a stream."""
-        if last:
-            self.z[lane] = 0
-            self.decay[lane] = 0
-            self.v_old[lane] = 0
-        else:
-            self.decay[lane] = discount_t * self.settings.lambda_
-            self.v_old[lane] = v_t
+    def close(self, lane: int, discount_t: Tensor, v_t: Tensor, last: Tensor) -> None:
+        """Remember the discount into the next state; drop everything after the last step of a stream.
+
+        ``last`` is not asked whether it is true: an accelerator would have to be waited for.
+        """
+        self.z[lane] = rules.cut(self.z[lane], last)
+        self.decay[lane] = torch.where(last, 0.0, discount_t * self.settings.lambda_)
+        self.v_old[lane] = torch.where(last, 0.0, v_t)
 
     def clear(self) -> None:
         for state in (self.z, self.decay, self.v_old):
@@ -187,14 +186,14 @@ class OnlineLearner:
         for lane in range(len(targets)):
             if weight is not None and weight[lane] == 0:
                 continue
-            if self.settings.cut == "watkins" and not greedy[lane]:
-                traces.z[lane] = 0
+            if self.settings.cut == "watkins":
+                traces.z[lane] = rules.cut(traces.z[lane], ~greedy[lane])
             q = self.engine.value_gradient(transition.s_tm1[lane], transition.a_tm1[lane])
             grad = self.engine.flat.grad
             z = traces.grow(lane, 0, grad)
             errors[lane] = targets[lane] - q
             total += traces.increment(lane, 0, z, grad, errors[lane], q)
-            traces.close(lane, discount_t[lane], q_t[lane].amax(), bool(transition.last_t[lane]))
+            traces.close(lane, discount_t[lane], q_t[lane].amax(), transition.last_t[lane])
         return total, Update(errors, targets)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
@@ -263,7 +262,7 @@ class PredictionLearner:
         errors = torch.zeros_like(targets)
         for lane in range(len(targets)):
             for output in range(self.num_outputs):
-                v = self.engine.value_gradient(transition.s_tm1[lane], torch.tensor(output))
+                v = self.engine.value_gradient(transition.s_tm1[lane], torch.tensor(output, device=v_t.device))
                 grad = self.engine.flat.grad
                 z = traces.grow(lane, output, grad)
                 if rho_tm1 is not None:
@@ -272,7 +271,7 @@ class PredictionLearner:
                     traces.z[lane, output] = z
                 errors[lane, output] = targets[lane, output] - v
                 total += traces.increment(lane, output, z, grad, errors[lane, output], v)
-            traces.close(lane, discount_t[lane], v_t[lane], bool(transition.last_t[lane]))
+            traces.close(lane, discount_t[lane], v_t[lane], transition.last_t[lane])
         return total, Update(errors, targets)
 
     def update(self, transition: Transition, rho_tm1: Tensor | None = None) -> Update:

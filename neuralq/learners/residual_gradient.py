@@ -152,7 +152,8 @@ class ResidualGradientLearner:
         factor = delta
         if weight is not None:
             check_same_shape("weight", weight, "r_t", transition.r_t)
-            factor = torch.where(weight == 0, 0.0, delta * weight.to(q.dtype))
+            weight = weight.to(q)
+            factor = torch.where(weight == 0, 0.0, delta * weight)
         direct = gradient((factor * q).mean(), self._parameters)
         return direct, direct - gradient((factor * other).mean(), self._parameters), Update(delta, target)
 

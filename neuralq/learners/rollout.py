@@ -154,7 +154,10 @@ class RolloutLearner:
         return rules.lambda_returns(r_t, transition.discount_t.to(v_t.dtype), v_t, lambda_, transition.last_t)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
-        """Fit one rollout ``[T, N]``; rows of weight 0 (an autoreset's step that was never taken) are left out."""
+        """Fit one rollout ``[T, N]``; rows of weight 0 (an autoreset's step that was never taken) are left out.
+
+        The weights are looked through on the host; where they are on an accelerator it is waited for.
+        """
         targets = self.targets(transition).reshape(-1)
         rows = None if weight is None else weight.reshape(-1).nonzero()[:, 0].cpu().numpy()
         num_rows = len(targets) if rows is None else len(rows)

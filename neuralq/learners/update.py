@@ -53,7 +53,7 @@ class Learner(Protocol):
         ...
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
-        """Learn from experience; ``weight`` has one entry per row, 0 for rows that are no experience."""
+        """Learn from experience; ``weight`` has one entry per row, 0 for rows that are no experience, on any device."""
         ...
 
     def begin_streams(self) -> None:

@@ -43,8 +43,8 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             "average_updates": 8.0,
         },
     },
-    # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves: ε may fall soon. Long
-    # rollouts and wide layers keep policies from forgetting the few starts that take long (docs/benchmarks.md).
+    # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves: ε may fall soon.
+    # Long rollouts and wide layers keep policies from forgetting the few starts that take long (docs/benchmarks.md).
     ("Acrobot-v1", "rollout"): {
         "total_steps": 200_000,
         "gamma": 0.995,
