@@ -127,9 +127,9 @@ def test_a_replay_learner_learns_the_same(weighted: bool, dtype: torch.dtype) ->
 
 def test_batches_that_do_not_pair_up_are_refused_as_before() -> None:
     learner, t = ReplayLearner(_engine(), ReplaySettings()), _batch(0, B)
-    for wrong in (replace(t, a_tm1=t.a_tm1[:3]), replace(t, s_tm1=t.s_tm1[:3]), replace(t, s_t=t.s_t[:3])):
+    for name in ("a_tm1", "s_tm1", "s_t", "r_t", "discount_t"):
         with pytest.raises((ValueError, RuntimeError)):
-            learner.update(wrong)
+            learner.update(replace(t, **{name: getattr(t, name)[:3]}))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

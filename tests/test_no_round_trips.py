@@ -46,7 +46,7 @@ CASES: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
         {"refresh_targets": True, "average_updates": 2.0, "anneal": True},
     )),
     *(("rollout", ROLLOUT, {"layout": layout}) for layout in ("action-input", "separate", "linear")),
-    ("rollout", ROLLOUT, {"layout": "table", "env": "FrozenLake-v1"}),
+    ("rollout", ROLLOUT, {"layout": "table", "env": "Taxi-v3"}),
     ("rollout", ROLLOUT, {"dueling": True}),
     *(("replay", {**REPLAY, **one}, {}) for one in (
         {}, {"target_rule": "double"}, {"target_rule": "munchausen"}, {"num_steps": 3}, {"prioritised": True},
@@ -55,7 +55,7 @@ CASES: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     )),
     *(("replay", {**DQRC, **one}, {}) for one in ({}, {"prioritised": True})),
     *(("replay", {**BLOCKS, "target_rule": rule}, {}) for rule in BLOCK_RULES),
-    ("replay", REPLAY, {"layout": "table", "env": "FrozenLake-v1"}),
+    ("replay", REPLAY, {"layout": "table", "env": "Taxi-v3"}),
     ("online", {}, {}),
     ("online", {}, {"layout": "separate"}),
     *(("streaming", one, {}) for one in STREAMING),
