@@ -46,20 +46,24 @@ CASES: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
         {"refresh_targets": True, "average_updates": 2.0, "anneal": True},
     )),
     *(("rollout", ROLLOUT, {"layout": layout}) for layout in ("action-input", "separate", "linear")),
-    ("rollout", ROLLOUT, {"layout": "table", "env": "Taxi-v3"}),
+    ("rollout", ROLLOUT, {"layout": "table", "env": "Taxi-v4"}),
+    ("rollout", ROLLOUT, {"env": "Taxi-v4"}),  # with masks
     ("rollout", ROLLOUT, {"dueling": True}),
     *(("replay", {**REPLAY, **one}, {}) for one in (
         {}, {"target_rule": "double"}, {"target_rule": "munchausen"}, {"num_steps": 3}, {"prioritised": True},
         {"distribution": "quantile"}, {"distribution": "quantile", "prioritised": True},
         BINS, {**BINS, "target_rule": "double", "prioritised": True}, {"loss": "squared"},
     )),
+    ("replay", {**REPLAY, "distribution": "quantile"}, {"env": "Taxi-v4"}),
     *(("replay", {**DQRC, **one}, {}) for one in ({}, {"prioritised": True})),
     *(("replay", {**BLOCKS, "target_rule": rule}, {}) for rule in BLOCK_RULES),
-    ("replay", REPLAY, {"layout": "table", "env": "Taxi-v3"}),
+    ("replay", REPLAY, {"layout": "table", "env": "Taxi-v4"}),
     ("online", {}, {}),
     ("online", {}, {"layout": "separate"}),
     *(("streaming", one, {}) for one in STREAMING),
+    ("streaming", {}, {"env": "Taxi-v4"}),
     ("gradient", {}, {}),
+    ("gradient", {}, {"env": "Taxi-v4"}),
     ("gradient", {"method": "gq"}, {"layout": "action-input"}),
 ]  # fmt: skip
 
