@@ -11,6 +11,7 @@ import json
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -52,6 +53,19 @@ def test_a_row_is_made_of_interquartile_means_with_intervals() -> None:
     assert words[:5] == ["CartPole-v1", "obgd/published", "5,000", "4", "495.0"] and words[-1] == "3.0"
     alone = script["line_of"](script["row_of"]("CartPole-v1", "obgd", outcomes[1:2])).split()
     assert alone[4:] == ["490.0", "-", "49.0", "-", "2.0"], "one seed has no interval"
+
+
+def test_a_seed_is_its_last_row_the_mean_of_its_evaluations_and_new_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    seed_of = runpy.run_path(str(SCRIPT))["seed_of"]
+    evaluations = [
+        {"kind": "evaluation", "env_steps": steps, "cpu_seconds": steps / 100, "greedy_return": greedy}
+        for steps, greedy in ((100, 10.0), (300, 50.0))
+    ]
+    rows = [evaluations[0], {"kind": "train", "env_steps": 200}, evaluations[1], {"kind": "train", "env_steps": 400}]
+    monkeypatch.setitem(seed_of.__globals__, "read_metrics", lambda _: rows)
+    monkeypatch.setitem(seed_of.__globals__, "evaluate_run", lambda _, num_episodes: SimpleNamespace(mean=num_episodes))
+    expected = {"env_steps": 300, "cpu_seconds": 3.0, "final_return": 20, "mean_return": 30.0}
+    assert seed_of(Path("run"), 7, 20) == {"seed": 7, **expected}
 
 
 @pytest.mark.slow
