@@ -3,9 +3,9 @@
 Acting, targets and gradients have a way of their own for compiled networks on plain observations, because tensors of a
 few numbers cost more than the arithmetic. The way through tensors is the oracle.
 
-Mutants that die here: target values from the live parameters; another draw, ε or order of draws; the weight left out;
-arrays of an earlier batch learned from; an update that is not counted, so that the target copy is late; samples that do
-not pair up; observations read as they lie when they have gaps or another type.
+Mutants that die here, each tried: target values from the live parameters; another draw, ε or order of draws; the weight
+left out; arrays of an earlier batch learned from; an update that is not counted, so that the target copy is late;
+samples that do not pair up; observations read as they lie when they have gaps or another type.
 """
 
 from __future__ import annotations

@@ -4,12 +4,13 @@ The oracles are slow: a match played with `Position` objects, turn for turn with
 over the 36 rolls; hand-made turns with a hit, from the bar and off the board; numpy's standard errors. What needs
 gnubg-nn (extra ``gnubg``) skips without it; what it could answer wrongly is answered by a stand-in.
 
-Mutants that must die here: an opening double · the same side first in every game · one pair's dice for all pairs ·
-the second game of a pair with dice of its own · points seen by the opponent · the standard error of games instead of
-pairs · ddof=0 · random players that never take the last afterstate · results that depend on the order of workers · an
-answer taken without a look at the legal turns · a hit that leaves the checker on its point · doubles weighted like
-other rolls · replies that are best for us instead of the other side · a finished game looked into · a window or a
-number of candidates that is not kept · chances not turned around · losses measured from the first afterstate.
+Mutants that die here, each tried: an opening double · the same side first in every game · one pair's dice for all
+pairs · the second game of a pair with dice of its own · points seen by the opponent · the standard error of games
+instead of pairs · ddof=0 · random players that never take the last afterstate · blocks in the order in which workers
+finish them · scratch that workers share · an answer taken without a look at the legal turns · a hit that leaves the
+checker on its point · doubles weighted like other rolls · replies that are best for us instead of the other side · a
+backgammon at the end of a reply counted as the outputs say · a window or a number of candidates that is not kept ·
+chances not turned around · losses measured from the first afterstate.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -217,7 +219,15 @@ def test_random_players_take_every_afterstate_alike() -> None:
     assert len(counts) == 16 and sum((n - 200) ** 2 / 200 for n in counts.values()) < 45
 
 
-def test_workers_change_nothing() -> None:
+def test_workers_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    play_block = match._play_block
+
+    def late(task: Any) -> Any:
+        if task[1].start == 0:  # so that the first block is the last that is done
+            time.sleep(0.5)
+        return play_block(task)
+
+    monkeypatch.setattr(match, "_play_block", late)
     one, two = (play_match(A, "random", 120, 6, workers=workers) for workers in (1, 2))
     assert one.points.tolist() == two.points.tolist() and one.turns.tolist() == two.turns.tolist()
     assert play_match(A, "random", 60, 6).points.tolist() == one.points[:60].tolist()
@@ -286,12 +296,31 @@ def test_candidates_are_cut_by_number_and_by_window() -> None:
     assert max(within) > MAX_CANDIDATES and 1 < min(within) < MAX_CANDIDATES
 
 
+@pytest.mark.parametrize(
+    ("name", "dice"),
+    [("Di9ioAPfVxAAUA", (6, 5)), ("W3orgADKPuAFQA", (5, 6)), ("cHPwQiCOHuIJQA", (1, 4)), ("7x8gAAp/gxIIQg", (4, 5))],
+    ids=["window", "window again", "number", "number again"],
+)
+def test_a_turn_that_is_no_candidate_is_not_chosen_even_if_it_is_the_best(name: str, dice: Dice) -> None:
+    position = Position.from_gnubg_id(name)
+    found = sorted(position.afterstates(dice), key=lambda after: value(A, after))
+    within = sum(value(A, after) <= value(A, found[0]) + WINDOW for after in found[:MAX_CANDIDATES])
+    worth = [looked_ahead(A, after)[0] for after in found]
+    assert 1 < within <= int(np.argmax(worth))
+    count = afterstates(position.board, *dice, A.scratch.boards)
+    chosen = A.scratch.boards[choose_two_ply(count, A.w, A.v, A.c, A.scratch)]
+    assert Position.from_board(chosen).board.tolist() == found[int(np.argmax(worth[:within]))].board.tolist()
+
+
 def test_chances_at_two_plies_are_those_of_the_side_that_moves() -> None:
     turn = BackgammonAgent(A, plies=2).ranked_turns(MIDDLE, (6, 4), 1)[0]
     y = looked_ahead(A, turn.position)[1]
     y /= y.sum()
     expected = y[0] + y[1], y[1], y[3]
     assert (turn.chances.win, turn.chances.gammon, turn.chances.lost_gammon) == pytest.approx(expected, abs=1e-12)
+    net = network(3, 1)
+    turn = BackgammonAgent(net, plies=2).ranked_turns(MIDDLE, (6, 4), 1)[0]
+    assert turn.chances.win == pytest.approx(looked_ahead(net, turn.position)[1][0], abs=1e-12)
 
 
 def test_other_plies_are_refused() -> None:

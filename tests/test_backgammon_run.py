@@ -1,8 +1,9 @@
 """Runs of TD-Gammon from the command line: what they leave, how they go on, and what they refuse.
 
-Faults looked for: the dice, the optimiser or the tally left out of the checkpoint · evaluation with the training
-dice · rows written twice after a kill · the next evaluation, row or checkpoint forgotten · the metrics of a killed run
-not cut back · schedules stretched by a new budget · weights of an old checkpoint loaded.
+Mutants that die here, each tried: the dice, the optimiser or the tally not taken from the checkpoint · evaluation that
+draws from the training dice · the metrics of a killed run not cut back, so that rows are written twice · the next
+evaluation or row, or the tally at the last row, forgotten · schedules stretched by a new budget · the older of two
+checkpoints loaded as the agent.
 """
 
 from __future__ import annotations

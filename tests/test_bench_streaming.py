@@ -1,8 +1,8 @@
 """The streaming benchmark: what a variant's name means, the row of an environment, and one tiny run from end to end.
 
-Mutants that die here: bound and cut exchanged · a variant without a cut read as the published one · the rollout learner
-given streaming settings · the preset's steps kept where others were asked for · the mean in place of the interquartile
-mean · final and mean returns exchanged · seeds that do not start at the first one.
+Mutants that die here, each tried: bound and cut exchanged · a variant without a cut read as the published one · the
+rollout learner given streaming settings · the preset's steps kept where others were asked for · the mean in place of
+the interquartile mean · final and mean returns exchanged, of a seed or of a row · seeds that do not start at the first.
 """
 
 from __future__ import annotations
