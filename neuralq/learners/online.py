@@ -93,9 +93,10 @@ class _Traces:
 
         ``last`` is not asked whether it is true: an accelerator would have to be waited for.
         """
-        self.z[lane] = rules.cut(self.z[lane], last)
-        self.decay[lane] = torch.where(last, 0.0, discount_t * self.settings.lambda_)
-        self.v_old[lane] = torch.where(last, 0.0, v_t)
+        self.decay[lane] = discount_t * self.settings.lambda_
+        self.v_old[lane] = v_t
+        for state in (self.z, self.decay, self.v_old):
+            state[lane].masked_fill_(last, 0.0)
 
     def clear(self) -> None:
         for state in (self.z, self.decay, self.v_old):
@@ -180,14 +181,14 @@ class OnlineLearner:
         r_t = transition.r_t.to(dtype) * self.reward_scale
         discount_t = transition.discount_t.to(dtype)
         targets = rules.q_learning(r_t, discount_t, q_t)
-        greedy = rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
+        explored = ~rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
         total = torch.zeros_like(self.engine.flat.values)
         errors = torch.zeros_like(targets)
         for lane in range(len(targets)):
             if weight is not None and weight[lane] == 0:
                 continue
             if self.settings.cut == "watkins":
-                traces.z[lane] = rules.cut(traces.z[lane], ~greedy[lane])
+                traces.z[lane].masked_fill_(explored[lane], 0.0)
             q = self.engine.value_gradient(transition.s_tm1[lane], transition.a_tm1[lane])
             grad = self.engine.flat.grad
             z = traces.grow(lane, 0, grad)
