@@ -15,8 +15,8 @@ def main(wheel: str) -> None:
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert tops == {"neuralq", "neuralq_envs", "neuralq_plugin.pth"}, f"unexpected top-level names: {sorted(tops)}"
     assert {"neuralq/py.typed", "neuralq_envs/py.typed"} <= set(names), "a py.typed is missing"
-    page = {f"neuralq/web/static/{name}" for name in (*STATIC, "play/backgammon.html", "play/tictactoe.html")}
-    page.add("neuralq/backgammon/weights.safetensors")
+    page = {f"neuralq/apps/web/static/{name}" for name in (*STATIC, "play/backgammon.html", "play/tictactoe.html")}
+    page.add("neuralq/systems/backgammon/weights.safetensors")
     assert page <= set(names), f"the pages are incomplete: {sorted(page - set(names))} are missing"
     strays = [name for name in names if name.endswith((".pyc", ".nbi", ".nbc"))]
     assert not strays, f"caches in the wheel: {strays}"

@@ -12,23 +12,23 @@ if TYPE_CHECKING:
     from neuralq import lab as lab
     from neuralq import learners as learners
     from neuralq import q as q
-    from neuralq import recipes as recipes
-    from neuralq import report as report
     from neuralq import rules as rules
+    from neuralq import runs as recipes
     from neuralq import tabular as tabular
+    from neuralq.learners.replay.buffer import ReplayBuffer as ReplayBuffer
     from neuralq.mdp import FiniteMDP as FiniteMDP
     from neuralq.q import ActionInputQ as ActionInputQ
     from neuralq.q import ActionOutputQ as ActionOutputQ
     from neuralq.q import LinearQ as LinearQ
     from neuralq.q import SeparateQ as SeparateQ
     from neuralq.q import TableQ as TableQ
-    from neuralq.recipes import Run as Run
-    from neuralq.recipes import RunConfig as RunConfig
-    from neuralq.recipes import load as load
-    from neuralq.recipes import resume as resume
-    from neuralq.recipes import train as train
-    from neuralq.recipes import with_preset as with_preset
-    from neuralq.replay import ReplayBuffer as ReplayBuffer
+    from neuralq.runs import Run as Run
+    from neuralq.runs import RunConfig as RunConfig
+    from neuralq.runs import load as load
+    from neuralq.runs import report as report
+    from neuralq.runs import resume as resume
+    from neuralq.runs import train as train
+    from neuralq.runs import with_preset as with_preset
     from neuralq.types import QFunction as QFunction
     from neuralq.types import Transition as Transition
 
@@ -62,24 +62,26 @@ __all__ = [
 ]
 
 # Where each name lives. A name here must not be the name of a module of this package: importing the module would
-# rebind the name (hence neuralq/training.py and not train.py).
+# rebind the name (hence neuralq/runs/loop.py and not train.py).
 _HOMES = {
     "ActionInputQ": "neuralq.q",
     "ActionOutputQ": "neuralq.q",
     "FiniteMDP": "neuralq.mdp",
     "LinearQ": "neuralq.q",
     "QFunction": "neuralq.types",
-    "ReplayBuffer": "neuralq.replay",
-    "Run": "neuralq.recipes",
-    "RunConfig": "neuralq.recipes",
+    "ReplayBuffer": "neuralq.learners.replay.buffer",
+    "Run": "neuralq.runs",
+    "RunConfig": "neuralq.runs",
     "SeparateQ": "neuralq.q",
     "TableQ": "neuralq.q",
     "Transition": "neuralq.types",
-    "load": "neuralq.recipes",
-    "resume": "neuralq.recipes",
-    "train": "neuralq.recipes",
-    "with_preset": "neuralq.recipes",
+    "load": "neuralq.runs",
+    "resume": "neuralq.runs",
+    "train": "neuralq.runs",
+    "with_preset": "neuralq.runs",
 }
+# Modules that are known by a shorter name than the way to their room.
+_ROOMS = {"recipes": "neuralq.runs", "report": "neuralq.runs.report"}
 
 
 if not TYPE_CHECKING:  # a type checker would believe that every name exists
@@ -97,7 +99,7 @@ if not TYPE_CHECKING:  # a type checker would believe that every name exists
             globals()[name] = value
             return value
         if not name.startswith("_"):
-            module = f"{__name__}.{name}"
+            module = _ROOMS.get(name, f"{__name__}.{name}")
             try:
                 return import_module(module)
             except ModuleNotFoundError as error:

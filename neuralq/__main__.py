@@ -2,7 +2,7 @@
 
 import sys
 
-from neuralq.cli import main
+from neuralq.apps.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any
 
 import neuralq
-from neuralq.recipes import with_preset
-from neuralq.record import read_metrics
+from neuralq.runs import with_preset
+from neuralq.runs.folder.run_folder import read_metrics
 
 TARGET = 475
 NUM_AFTER = 3

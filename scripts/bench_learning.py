@@ -35,9 +35,9 @@ from pathlib import Path
 from typing import Any
 
 import neuralq
-from neuralq.aggregate import estimate
-from neuralq.recipes import evaluate_run, with_preset
-from neuralq.record import read_metrics
+from neuralq.runs import evaluate_run, with_preset
+from neuralq.runs.folder.run_folder import read_metrics
+from neuralq.runs.sweep.statistics import estimate
 
 THRESHOLDS: dict[str, float | None] = {
     "CartPole-v1": 475.0,

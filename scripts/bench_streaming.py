@@ -26,12 +26,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from neuralq.aggregate import estimate
-from neuralq.cli.sweeps import SweepBar
-from neuralq.recipes import RunConfig, evaluate_run, with_preset
-from neuralq.recipes.config import config_to_dict
-from neuralq.record import read_metrics
-from neuralq.sweep import Sweep, create_sweep, num_cores, run_sweep
+from neuralq.apps.cli.sweeps import SweepBar
+from neuralq.runs import RunConfig, evaluate_run, with_preset
+from neuralq.runs.folder.run_folder import read_metrics
+from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.sweep import Sweep, create_sweep, num_cores, run_sweep
+from neuralq.runs.sweep.statistics import estimate
 
 ENVS = ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")
 BOUNDS = ("obgd", "adaptive-obgd", "intentional")
@@ -52,7 +52,7 @@ def config_of(env: str, variant: str, num_steps: int | None) -> RunConfig:
 def command(sweep: Sweep, seed: int) -> list[str]:
     """Trains one seed in a process that stops with this one."""
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
-    program = "from neuralq.cli.sweeps import child; child()"
+    program = "from neuralq.apps.cli.sweeps import child; child()"
     run = ["--seed", str(seed), "--run-dir", str(sweep.run_path(seed))]
     return [sys.executable, "-c", program, "train", *config, *run]
 

@@ -17,8 +17,8 @@ import argparse
 import time
 from pathlib import Path
 
-from neuralq.lab.drawn import FIGURES, Drawing, png_of, svg_of
-from neuralq.report import MissingExtra
+from neuralq.checks import MissingExtra
+from neuralq.lab.figures import FIGURES, Drawing, png_of, svg_of
 
 
 def write(drawing: Drawing, folder: Path, formats: list[str], with_caption: bool) -> list[str]:

@@ -19,8 +19,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuralq.record import read_config, read_metrics
-from neuralq.report.svg import COLOURS, draw_svg, steps_axis
+from neuralq.figures import COLOURS, draw_svg, steps_axis
+from neuralq.runs.folder.run_folder import read_config, read_metrics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

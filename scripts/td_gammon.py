@@ -18,8 +18,8 @@ import argparse
 
 import neuralq
 from neuralq.backgammon import SelfPlaySettings
-from neuralq.backgammon.config import TdGammonConfig
-from neuralq.backgammon.run import train_games
+from neuralq.systems.backgammon.config import TdGammonConfig
+from neuralq.systems.backgammon.run import train_games
 from neuralq_envs.backgammon import Position
 
 EXAMPLES = """examples:

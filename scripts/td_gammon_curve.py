@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuralq.record import read_metrics, read_seed
-from neuralq.report.svg import COLOURS, MARKERS, draw_svg
+from neuralq.figures import COLOURS, MARKERS, draw_svg
+from neuralq.runs.folder.run_folder import read_metrics, read_seed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

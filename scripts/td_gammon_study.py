@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuralq.backgammon import SelfPlay, SelfPlaySettings
-from neuralq.backgammon.match import play_match
-from neuralq.report.svg import COLOURS, MARKERS, draw_svg
+from neuralq.figures import COLOURS, MARKERS, draw_svg
+from neuralq.systems.backgammon.match import play_match
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

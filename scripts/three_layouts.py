@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 import neuralq
-from neuralq.recipes import with_preset
-from neuralq.record import read_metrics
+from neuralq.runs import with_preset
+from neuralq.runs.folder.run_folder import read_metrics
 
 
 def learn(case: tuple[str, str, int, int]) -> dict[str, Any]:

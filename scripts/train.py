@@ -19,7 +19,7 @@ import argparse
 import gymnasium
 
 import neuralq
-from neuralq.recipes import with_preset
+from neuralq.runs import with_preset
 
 
 def main() -> None:

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from neuralq.backgammon import ValueNetwork, learning_kernels
-from neuralq.backgammon.network import equities
+from neuralq.systems.backgammon import ValueNetwork, learning_kernels
+from neuralq.systems.backgammon.network import equities
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.inputs import NUM_INPUTS, tesauro_dense
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates, result

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import sample_of_arcs, stream
 from neuralq.lab.methods import Method
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import sample_of_arcs, stream
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem
 

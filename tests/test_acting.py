@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from neuralq import rules
-from neuralq.acting import choose_epsilon_greedy, choose_greedy, epsilon_greedy_policy
+from neuralq.runs.stream.acting import choose_epsilon_greedy, choose_greedy, epsilon_greedy_policy
 
 INF = math.inf
 

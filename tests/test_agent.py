@@ -16,12 +16,12 @@ import torch
 from gymnasium import spaces
 
 import neuralq
-from neuralq import checkpoint
-from neuralq.checkpoint import CheckpointError
 from neuralq.learners import OnlineSettings, RolloutSettings
 from neuralq.q import MLP
-from neuralq.recipes import RunConfig
-from neuralq.record import RunFolderError
+from neuralq.runs import RunConfig
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.checkpoint import CheckpointError
+from neuralq.runs.folder.run_folder import RunFolderError
 
 
 class Bandit(gym.Env[Any, Any]):
@@ -124,7 +124,7 @@ def test_an_observation_of_another_shape_is_refused(cartpole: Path) -> None:
 
 
 def test_loading_takes_no_lock(cartpole: Path) -> None:
-    from neuralq.record import RunFolder
+    from neuralq.runs.folder.run_folder import RunFolder
 
     with RunFolder.open(cartpole):
         assert neuralq.load(cartpole).predict(np.zeros(4, np.float32)) in (0, 1)

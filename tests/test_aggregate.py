@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from neuralq.aggregate import bootstrap_interval, estimate, interquartile_mean
+from neuralq.runs.sweep.statistics import bootstrap_interval, estimate, interquartile_mean
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_points_of_a_curve_are_resampled_by_whole_runs() -> None:
 def test_many_resamples_are_drawn_in_pieces_of_the_same_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = np.random.default_rng(0).standard_normal(8)
     whole = bootstrap_interval(runs, np.random.default_rng(1), num_resamples=2_000)
-    monkeypatch.setattr("neuralq.aggregate._MOST_DRAWN", 8 * 333)
+    monkeypatch.setattr("neuralq.runs.sweep.statistics._MOST_DRAWN", 8 * 333)
     pieces = bootstrap_interval(runs, np.random.default_rng(1), num_resamples=2_000)
     np.testing.assert_array_equal(pieces, whole)
 

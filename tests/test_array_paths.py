@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq.acting import epsilon_greedy_policy
-from neuralq.features import OneHot
-from neuralq.interact import Interaction
 from neuralq.learners import ReplayLearner, ReplaySettings, RolloutLearner, RolloutSettings
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, MaskedQ, SeparateQ, TableQ
 from neuralq.q.engine import Loss, MlpEngine, TorchEngine, array_values, make_engine, on_arrays
+from neuralq.q.inputs import OneHot
+from neuralq.runs.stream import Interaction
+from neuralq.runs.stream.acting import epsilon_greedy_policy
 from neuralq.types import Transition
 
 DTYPES = (torch.float32, torch.float64)

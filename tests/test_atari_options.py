@@ -11,12 +11,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from neuralq.interact import Interaction
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
-from neuralq.recipes import RunConfig
-from neuralq.recipes.build import build_session, make_envs
-from neuralq.recipes.games import make_single
+from neuralq.runs import RunConfig
+from neuralq.runs.recipe.build import build_session, make_envs
+from neuralq.runs.recipe.games import make_single
+from neuralq.runs.stream import Interaction
 
 needs_atari = pytest.mark.skipif(
     not all(__import__("importlib.util").util.find_spec(name) for name in ("ale_py", "cv2")),

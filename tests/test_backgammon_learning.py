@@ -31,16 +31,9 @@ from backgammon_learning_slowly import (
     worst,
 )
 
-from neuralq.backgammon import (
-    BackgammonAgent,
-    SelfPlay,
-    SelfPlaySettings,
-    ValueNetwork,
-    kernels,
-    torch_engine,
-)
-from neuralq.backgammon.network import equities
-from neuralq.backgammon.torch_engine import TorchBatch, TorchValues
+from neuralq.systems.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork, kernels, torch_engine
+from neuralq.systems.backgammon.network import equities
+from neuralq.systems.backgammon.torch_engine import TorchBatch, TorchValues
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.inputs import tesauro_dense
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates, result, roll

@@ -27,13 +27,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuralq.backgammon import BackgammonAgent, ValueNetwork, match, opponents
-from neuralq.backgammon.error_rate import decisions, error_rate
-from neuralq.backgammon.match import MatchResult, Side, play_match, turn_taker
-from neuralq.backgammon.opponents import GnubgPlayer, IllegalTurn
-from neuralq.backgammon.search import MAX_CANDIDATES, WINDOW, choose_two_ply, look_ahead
-from neuralq.cli import main
-from neuralq.report import MissingExtra
+from neuralq.apps.cli import main
+from neuralq.checks import MissingExtra
+from neuralq.systems.backgammon import BackgammonAgent, ValueNetwork, match, opponents
+from neuralq.systems.backgammon.error_rate import decisions, error_rate
+from neuralq.systems.backgammon.match import MatchResult, Side, play_match, turn_taker
+from neuralq.systems.backgammon.opponents import GnubgPlayer, IllegalTurn
+from neuralq.systems.backgammon.search import MAX_CANDIDATES, WINDOW, choose_two_ply, look_ahead
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates
 
@@ -378,7 +378,7 @@ def test_without_the_package(name: str, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_losses_are_those_of_the_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a stand-in that knows nothing but the checkers borne off, on one decision."""
-    from neuralq.backgammon import error_rate as module
+    from neuralq.systems.backgammon import error_rate as module
 
     board = np.zeros((2, 25), np.int8)
     board[0, [4, 3, 0]], board[1, 5] = [1, 1, 1], 14

@@ -23,11 +23,11 @@ import numpy as np
 import pytest
 
 import neuralq
-from neuralq.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
-from neuralq.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
-from neuralq.backgammon.run import GammonRun, load_agent, resume_games, train_games
-from neuralq.cli import main
-from neuralq.record import RunFolderError, read_config, read_metrics, read_summary
+from neuralq.apps.cli import main
+from neuralq.runs.folder.run_folder import RunFolderError, read_config, read_metrics, read_summary
+from neuralq.systems.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
+from neuralq.systems.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
+from neuralq.systems.backgammon.run import GammonRun, load_agent, resume_games, train_games
 from neuralq_envs.backgammon import Position
 
 ROOT = Path(__file__).parents[1]
@@ -124,8 +124,8 @@ def test_a_larger_budget_keeps_the_schedules(tmp_path: Path) -> None:
 
 DOOMED = """
 import json, os, signal, sys
-from neuralq.backgammon.config import config_from_dict
-from neuralq.backgammon.run import train_games
+from neuralq.systems.backgammon.config import config_from_dict
+from neuralq.systems.backgammon.run import train_games
 
 def die(row):
     if row["games"] == 50:
@@ -184,13 +184,13 @@ def test_what_was_learned_plays(tmp_path: Path) -> None:
 
 def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:
     def spoil(path: Path) -> None:
-        saved = neuralq.checkpoint.load_newest(path / "checkpoints")
+        saved = neuralq.runs.folder.checkpoint.load_newest(path / "checkpoints")
         saved.state["learner"]["weights"] = np.full_like(saved.state["learner"]["weights"], np.nan)
-        neuralq.checkpoint.save(path / "checkpoints", saved.step, saved.state)
+        neuralq.runs.folder.checkpoint.save(path / "checkpoints", saved.step, saved.state)
 
     run = train_games(configuration(SMALL), tmp_path / "run")
     spoil(run.run_dir)
-    with pytest.raises(neuralq.training.Diverged, match="no longer finite"):
+    with pytest.raises(neuralq.runs.loop.Diverged, match="no longer finite"):
         resume_games(run.run_dir, 70)
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq import training
-from neuralq.best import keep_best, load_best
-from neuralq.checkpoint import CheckpointError
-from neuralq.cli import main
-from neuralq.evaluation import Evaluation
+from neuralq.apps.cli import main
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
-from neuralq.recipes import RunConfig, evaluate_run, load, resume, train
+from neuralq.runs import RunConfig, evaluate_run, load, resume, train
+from neuralq.runs import loop as training
+from neuralq.runs.evaluation import Evaluation
+from neuralq.runs.folder.best import keep_best, load_best
+from neuralq.runs.folder.checkpoint import CheckpointError
 
 CONFIG = RunConfig(
     total_steps=64, evaluate_every=16, evaluation_episodes=2, log_every=64, checkpoint_every=16, body=MLP((4,)),
@@ -86,7 +86,7 @@ def test_statistics_of_observations_are_kept_along(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_something_else_is_refused(tmp_path: Path) -> None:
-    from neuralq import checkpoint
+    from neuralq.runs.folder import checkpoint
 
     checkpoint.save(tmp_path / "best", 3, {"other": 1})
     with pytest.raises(CheckpointError, match="holds no parameters"):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neuralq import rules
-from neuralq.learners.bootstrap import q_learning_targets
+from neuralq.learners.replay.targets import q_learning_targets
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

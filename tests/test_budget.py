@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import yaml
 
-from neuralq.cli import main
-from neuralq.recipes import RunConfig, with_preset
-from neuralq.recipes.budget import cut_to_budget
-from neuralq.recipes.presets import PRESETS
+from neuralq.apps.cli import main
+from neuralq.runs import RunConfig, with_preset
+from neuralq.runs.recipe.budget import cut_to_budget
+from neuralq.runs.recipe.presets import PRESETS
 
 Capture = pytest.CaptureFixture[str]
 PRESET: dict[str, Any] = {

@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuralq import chapter
-from neuralq.chapter import PAGES, run_page
-from neuralq.chapter.exercises import exercise_13_2, exercise_13_4
-from neuralq.chapter.exhibit import Arrow, Cell, Chart, Exhibit, Grid, Row, Series, claim, misprint, number, own
-from neuralq.chapter.figures import exercise_13_1, figure_13_2, figure_13_3
-from neuralq.chapter.learning import table_13_1
-from neuralq.chapter.models import dyna_maze, sweeping
-from neuralq.chapter.noughts import exercise_13_3
-from neuralq.chapter.ordering import replaying, update_order
-from neuralq.chapter.prediction import lambda_recursion, random_walk_page
-from neuralq.chapter.svg import exhibit_svg
-from neuralq.chapter.text import drawing_lines
-from neuralq.cli import main
+from neuralq.apps import chapter
+from neuralq.apps.chapter import PAGES, run_page
+from neuralq.apps.chapter.exercises import exercise_13_2, exercise_13_4
+from neuralq.apps.chapter.figures import exercise_13_1, figure_13_2, figure_13_3
+from neuralq.apps.chapter.learning import table_13_1
+from neuralq.apps.chapter.models import dyna_maze, sweeping
+from neuralq.apps.chapter.ordering import replaying, update_order
+from neuralq.apps.chapter.prediction import lambda_recursion, random_walk_page
+from neuralq.apps.chapter.tic_tac_toe import exercise_13_3
+from neuralq.apps.cli import main
+from neuralq.apps.pages.page import Arrow, Cell, Chart, Exhibit, Grid, Row, Series, claim, misprint, number, own
+from neuralq.apps.pages.svg import exhibit_svg
+from neuralq.apps.pages.text import drawing_lines
 
 Capture = pytest.CaptureFixture[str]
 
@@ -218,7 +218,7 @@ def test_a_number_that_is_not_reproduced_ends_with_status_1(monkeypatch: pytest.
     def broken() -> Exhibit:
         return Exhibit("fig-13.3", "t", "s", (), (Row("V*", 90.0, 91.0, "differs"),))
 
-    monkeypatch.setattr("neuralq.chapter.figures.figure_13_3", broken)
+    monkeypatch.setattr("neuralq.apps.chapter.figures.figure_13_3", broken)
     assert chapter.run_page("fig-13.3").rows[0].ours == 91.0
     assert main(["chapter", "fig-13.3", "--json"]) == 1
     captured = capsys.readouterr()

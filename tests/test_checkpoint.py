@@ -20,7 +20,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from neuralq.checkpoint import CheckpointError, load, load_newest, save
+from neuralq.runs.folder.checkpoint import CheckpointError, load, load_newest, save
 
 
 def same(a: Any, b: Any) -> bool:

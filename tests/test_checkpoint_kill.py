@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq import checkpoint
-from neuralq.checkpoint import CheckpointError, load_newest, save
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.checkpoint import CheckpointError, load_newest, save
 
 
 class Killed(BaseException):
@@ -105,7 +105,7 @@ def test_a_full_disk_is_one_clear_error_and_the_last_checkpoint_is_intact(
 
 WRITER = """
 import os, sys, time, numpy as np, torch
-from neuralq.checkpoint import save
+from neuralq.runs.folder.checkpoint import save
 torch.set_num_threads(1)
 for child in range(6):
     if os.fork() == 0:

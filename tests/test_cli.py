@@ -19,10 +19,10 @@ import pytest
 import yaml
 from gymnasium import spaces
 
-from neuralq.cli import COMMANDS, main
-from neuralq.recipes import RunConfig
-from neuralq.recipes.config import config_from_dict
-from neuralq.record import read_config
+from neuralq.apps.cli import COMMANDS, main
+from neuralq.runs import RunConfig
+from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.recipe.config import config_from_dict
 
 KEYS = {"env_steps", "cpu_seconds", "wall_seconds", "greedy_return", "parameters_sha256", "run_dir"}
 TINY = ["--total-steps", "200", "--evaluate-every", "5000", "--evaluation-episodes", "2"]
@@ -66,7 +66,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_help_imports_nothing_heavy_and_names_every_command() -> None:
     program = (
-        "import sys; from neuralq.cli import main\n"
+        "import sys; from neuralq.apps.cli import main\n"
         "try: main(['--help'])\n"
         "finally: print(sorted({'torch', 'numpy', 'gymnasium', 'numba', 'scipy', 'rich', 'yaml', 'jsonargparse'}"
         " & set(sys.modules)))"

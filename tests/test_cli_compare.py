@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuralq.cli import main
-from neuralq.record import RunFolder, RunFolderError
-from neuralq.report.comparison import group_curve, read_groups
-from neuralq.sweep import create_sweep
+from neuralq.apps.cli import main
+from neuralq.runs.folder.run_folder import RunFolder, RunFolderError
+from neuralq.runs.report.comparison import group_curve, read_groups
+from neuralq.runs.sweep import create_sweep
 
 Capture = pytest.CaptureFixture[str]
 
@@ -173,7 +173,7 @@ def test_presets_are_listed_with_their_settings(monkeypatch: pytest.MonkeyPatch,
         "rollout": {"lambda_": 0},
     }
     known = {("CartPole-v1", "rollout"): rollout, ("Acrobot-v1", "online"): {"gamma": 1.0}}
-    monkeypatch.setattr("neuralq.cli.presets.PRESETS", known)
+    monkeypatch.setattr("neuralq.apps.cli.presets.PRESETS", known)
     assert main(["presets"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "CartPole-v1, rollout learner: neuralq train CartPole-v1",

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from neuralq.cli import main
+from neuralq.apps.cli import main
 
 Capture = pytest.CaptureFixture[str]
 

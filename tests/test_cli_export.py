@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from neuralq.cli import export as export_module
-from neuralq.cli import main
-from neuralq.interact import Normalisation
-from neuralq.recipes import load
-from neuralq.sweep import create_sweep
+from neuralq.apps.cli import export as export_module
+from neuralq.apps.cli import main
+from neuralq.runs import load
+from neuralq.runs.stream import Normalisation
+from neuralq.runs.sweep import create_sweep
 
 onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnx")
@@ -138,7 +138,7 @@ def test_statistics_of_observations_are_part_of_the_file(
 ) -> None:
     run = trained(tmp_path / "run", "CartPole-v1")
     agent = load(run)
-    seen = Normalisation((4,), 0.99, num_lanes=3)
+    seen = Normalisation((4,), 0.99, num_envs=3)
     for row in np.random.default_rng(0).normal([0.0, 1.0, -2.0, 50.0], [1.0, 0.1, 3.0, 0.01], (40, 3, 4)):
         seen.observe(row)
     agent.normalisation = seen.frozen()

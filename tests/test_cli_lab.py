@@ -21,9 +21,9 @@ from typing import Any
 
 import pytest
 
-import neuralq.cli.lab_matrix as lab_matrix
-from neuralq.cli import COMMANDS, main
-from neuralq.cli.lab import COMMANDS as LAB
+import neuralq.apps.cli.lab_matrix as lab_matrix
+from neuralq.apps.cli import COMMANDS, main
+from neuralq.apps.cli.lab import COMMANDS as LAB
 from neuralq.lab import METHODS, PROBLEMS, Matrix
 
 Capture = pytest.CaptureFixture[str]
@@ -205,22 +205,22 @@ def test_refusals_say_what_to_do(capsys: Capture, argv: list[str], code: int, me
 
 def test_serve_stays_on_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, int]] = []
-    web = types.ModuleType("neuralq.web")
+    web = types.ModuleType("neuralq.apps.web")
     web.serve = lambda host, port: asked.append((host, port))  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "neuralq.web", web)
+    monkeypatch.setitem(sys.modules, "neuralq.apps.web", web)
     assert status(["--serve"]) == 0
     assert status(["--serve", "--host", "0.0.0.0", "--port", "0"]) == 0
     assert asked == [("127.0.0.1", 8765), ("0.0.0.0", 0)]
 
 
 def test_a_missing_extra_is_one_line_with_the_command(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "neuralq.web", None)
+    monkeypatch.setitem(sys.modules, "neuralq.apps.web", None)
     assert "pip install 'neuralq[web]'" in refusal(capsys, "--serve")
 
 
 def test_help_and_diagnosis_import_no_torch() -> None:
     code = (
-        "import sys; from neuralq.cli import main\n"
+        "import sys; from neuralq.apps.cli import main\n"
         "try: main(['lab', '--help'])\n"
         "except SystemExit: pass\n"
         "assert 'numpy' not in sys.modules\n"

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 import neuralq.lab
-from neuralq.cli import main
-from neuralq.cli.fitted_choices import REGRESSORS, WORLDS
-from neuralq.lab.fitted_diagnosis import diagnose_fitted
-from neuralq.lab.regressors import LeastSquares, NearestNeighbours, linear_features
+from neuralq.apps.cli import main
+from neuralq.apps.cli.fitted_choices import REGRESSORS, WORLDS
+from neuralq.lab.fitted.diagnosis import diagnose_fitted
+from neuralq.lab.fitted.regressors import LeastSquares, NearestNeighbours, linear_features
 from neuralq_envs.counterexamples.boyan_moore import gridworld, puddle_world
 from neuralq_envs.counterexamples.continuous import grid_support, random_support
 
@@ -208,7 +208,7 @@ def test_the_lab_exports_it_all() -> None:
 
 def test_without_a_network_torch_is_not_loaded() -> None:
     code = (
-        "import sys; from neuralq.cli import main\n"
+        "import sys; from neuralq.apps.cli import main\n"
         "main(['lab', 'fitted', 'gridworld', '--points', '4', '--json'])\n"
         "assert 'torch' not in sys.modules"
     )

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from neuralq.cli import film, main, media
-from neuralq.cli.film import GifWriter, Moment, caption, frame_rate, picture, play
-from neuralq.recipes import load
-from neuralq.sweep import create_sweep
-from neuralq.training import seed_for
+from neuralq.apps.cli import film, main, media
+from neuralq.apps.cli.film import GifWriter, Moment, caption, frame_rate, picture, play
+from neuralq.runs import load
+from neuralq.runs.loop import seed_for
+from neuralq.runs.sweep import create_sweep
 
 Image = pytest.importorskip("PIL.Image")
 

@@ -16,12 +16,12 @@ import pytest
 import torch
 from torch import nn
 
-from neuralq.cli import main
+from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings, RolloutSettings
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Custom, DuelingQ, SeparateQ
 from neuralq.q.engine import Loss, TorchEngine, make_engine
-from neuralq.recipes import RunConfig, evaluate_run, load, resume, train
-from neuralq.recipes.config import config_from_dict, config_to_dict
+from neuralq.runs import RunConfig, evaluate_run, load, resume, train
+from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 
 SOURCE = """
 import torch

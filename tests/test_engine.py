@@ -21,10 +21,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from neuralq.features import OneHot, Pixels
-from neuralq.optim import FlatOptimiser, Optimiser
+from neuralq.learners.optim import FlatOptimiser, Optimiser
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
 from neuralq.q.engine import Loss, MlpEngine, TorchEngine, make_engine, runs_compiled
+from neuralq.q.inputs import OneHot, Pixels
 
 A, D = 3, 4
 LAYOUTS: tuple[Any, ...] = (ActionInputQ, SeparateQ, ActionOutputQ)

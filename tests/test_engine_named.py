@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from neuralq.cli import main
+from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings, StreamingSettings
 from neuralq.q import MLP, Custom
-from neuralq.recipes import RunConfig, build
-from neuralq.recipes.build import build_session, engine_name
-from neuralq.record import read_config
-from neuralq.snapshot import Resumability
+from neuralq.runs import RunConfig
+from neuralq.runs.folder import Resumability
+from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.recipe import build
+from neuralq.runs.recipe.build import build_session, engine_name
 
 CASES = [
     (RunConfig(body=MLP((8,))), "compiled"),

@@ -7,9 +7,10 @@ when it leaves; velocity clipped after the position moved; the goal's velocity i
 excluded; half a Runge-Kutta step where a whole one is due; weights 1, 2, 1, 2 of the four slopes; an angle not wrapped;
 the other joint's velocity bound; reward −1 for arriving; the tip's height without its first link; x · x for x², in
 three places; truncation one step late, or withheld where the episode terminates in that step; an episode that goes on
-after truncation; step counts that a reset forgets, or resets in every lane; one seed or one generator for every lane;
-starts drawn in lanes that are not reset; a start that is not rounded to float32; an array handed out and overwritten
-later; an action 3 let through; a twin for an environment with wrappers, unknown arguments or another time limit.
+after truncation; step counts that a reset forgets, or resets everywhere; one seed or one generator for all;
+starts drawn in environments that are not reset; a start that is not rounded to float32; an array handed out and
+overwritten later; an action 3 let through; a twin for an environment with wrappers, unknown arguments or another time
+limit.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import neuralq_envs
-from neuralq.interact import Interaction
-from neuralq.recipes import RunConfig
-from neuralq.recipes.build import make_envs
-from neuralq.snapshot import is_resumable
+from neuralq.runs import RunConfig
+from neuralq.runs.folder import is_resumable
+from neuralq.runs.recipe.build import make_envs
+from neuralq.runs.stream import Interaction
 from neuralq_envs import vector_twin
 from neuralq_envs.classic import ClassicVectorEnv, make_acrobot_vector, make_mountain_car_vector
 
@@ -160,7 +161,7 @@ def test_starts_are_drawn_lane_by_lane_as_gymnasium_draws_them(env_id: str, opti
         mine = ours.reset(seed=seed, options=dict(extra))[0]
         _assert_same([mine], theirs.reset(seed=seed, options=dict(extra))[:1])
     single = gymnasium.make(env_id).unwrapped.reset(seed=44)[0]
-    assert single.tobytes() == ours.reset(seed=42)[0][2].tobytes()  # lane i is seeded with seed + i
+    assert single.tobytes() == ours.reset(seed=42)[0][2].tobytes()  # environment i is seeded with seed + i
 
 
 def test_without_a_seed_starts_differ_between_lanes_and_makings() -> None:

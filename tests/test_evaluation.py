@@ -1,8 +1,8 @@
-"""Greedy evaluation: the first episode of every lane, each once, on episodes that the seed decides.
+"""Greedy evaluation: the first episode of every environment, each once, on episodes that the seed decides.
 
-Mutants that these tests kill: whichever episodes end first are taken (short ones win); a second episode of a lane
-counted while another is still in its first; an episode that never ends dropped instead of counted as cut; rounds that
-repeat their seeds; the action of the lowest instead of the highest value.
+Mutants that these tests kill: whichever episodes end first are taken (short ones win); a second episode of an
+environment counted while another is still in its first; an episode that never ends dropped instead of counted as cut;
+rounds that repeat their seeds; the action of the lowest instead of the highest value.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from neuralq.evaluation import evaluate_greedy
-from neuralq.interact import Interaction
+from neuralq.runs.evaluation import evaluate_greedy
+from neuralq.runs.stream import Interaction
 
 
 class Countdown(gym.Env[Any, Any]):
@@ -45,15 +45,15 @@ def prefer_one(s: Tensor) -> Tensor:
     return torch.stack([torch.zeros(len(s)), torch.ones(len(s))], -1)
 
 
-def stream_of(mode: AutoresetMode, num_lanes: int, endless: bool = False) -> Interaction:
-    return Interaction(SyncVectorEnv([lambda: Countdown(endless)] * num_lanes, autoreset_mode=mode), 0.9, 0)
+def stream_of(mode: AutoresetMode, num_envs: int, endless: bool = False) -> Interaction:
+    return Interaction(SyncVectorEnv([lambda: Countdown(endless)] * num_envs, autoreset_mode=mode), 0.9, 0)
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-@pytest.mark.parametrize("num_lanes", [1, 3, 8])
-def test_every_episode_counts_once_in_the_order_of_the_lanes(mode: AutoresetMode, num_lanes: int) -> None:
-    result = evaluate_greedy(prefer_one, stream_of(mode, num_lanes), 7, seed=10)
-    lengths = [1 + (10 + i) % 5 for i in range(7)]  # one lane or eight: the seeds go on from round to round
+@pytest.mark.parametrize("num_envs", [1, 3, 8])
+def test_every_episode_counts_once_in_the_order_of_the_lanes(mode: AutoresetMode, num_envs: int) -> None:
+    result = evaluate_greedy(prefer_one, stream_of(mode, num_envs), 7, seed=10)
+    lengths = [1 + (10 + i) % 5 for i in range(7)]  # one environment or eight: the seeds go on from round to round
     assert result.lengths == tuple(lengths)
     assert result.returns == tuple(float(n * n) for n in lengths)
     assert result.mean == np.mean([n * n for n in lengths])

@@ -2,7 +2,7 @@
 
 Planted mutants that these tests kill: the copy left out of `floats` or of the image path; `start` not subtracted; radix
 order reversed; the one-hot column offset left out; `>=` limit check turned into `>`; the finite check left out or run
-before the cast to float32; the part order of a Dict reversed; lanes and entries swapped in the error.
+before the cast to float32; the part order of a Dict reversed; environments and entries swapped in the error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from gymnasium import Space, spaces
 from gymnasium.spaces.utils import flatten
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from neuralq.features import MAX_TABLE_STATES, ObservationError, OneHot, Pixels, discrete_actions, encoder_for
+from neuralq.q.inputs import OneHot, Pixels
+from neuralq.runs.stream.encoding import MAX_TABLE_STATES, ObservationError, discrete_actions, encoder_for
 
 
 def batch_of(space: Space[Any], samples: list[Any]) -> Any:
@@ -179,7 +180,7 @@ NESTED = spaces.Dict({"speed": spaces.Box(-1, 1, (2,)), "gear": spaces.Tuple((sp
 
 
 @pytest.mark.parametrize(
-    ("space", "batch", "lane", "field", "words"),
+    ("space", "batch", "environment", "field", "words"),
     [
         (spaces.Box(-1, 1, (2,)), NAN, 1, "observation", r"finite, got nan at index \(1,\)"),
         (spaces.Box(-1, 1, ()), np.array([0, 0, -np.inf]), 2, "observation", "finite, got -inf$"),
@@ -197,23 +198,25 @@ NESTED = spaces.Dict({"speed": spaces.Box(-1, 1, (2,)), "gear": spaces.Tuple((sp
         (spaces.MultiBinary(2), np.array([[0, 1], [2, 0]]), 1, "observation", r"lie in 0\.\.1, got 2 at flat index 0"),
         (NESTED, {"speed": FLOATS}, None, "observation", r"dict holding 'gear', got dict of \['speed'\]"),
         (NESTED, {"gear": (), "speed": 0}, None, "observation['gear']", "tuple holding 0, got tuple"),
-        (NESTED, {"gear": (np.array([1]),), "speed": FLOATS}, None, "observation['speed']", "has 2 lanes"),
+        (NESTED, {"gear": (np.array([1]),), "speed": FLOATS}, None, "observation['speed']", "has 2 environments"),
         (NESTED, {"gear": (np.array([1, 9]),), "speed": FLOATS}, 1, "observation['gear'][0]", "got 9"),
     ],
 )  # fmt: skip
-def test_refusals_name_lane_and_field(space: Space[Any], batch: Any, lane: int | None, field: str, words: str) -> None:
+def test_refusals_name_lane_and_field(
+    space: Space[Any], batch: Any, env_index: int | None, field: str, words: str
+) -> None:
     with pytest.raises(ObservationError, match=words) as caught:
         encoder_for(space).encode(batch)
-    assert (caught.value.lane, caught.value.field) == (lane, field)
-    assert str(caught.value).startswith(f"environment {lane}: {field} " if lane is not None else f"{field} ")
+    assert (caught.value.env_index, caught.value.field) == (env_index, field)
+    assert str(caught.value).startswith(f"environment {env_index}: {field} " if env_index is not None else f"{field} ")
     again = copy.deepcopy(caught.value)  # rebuilt from its arguments, as when it travels from a worker process
-    assert (str(again), again.lane, again.field) == (str(caught.value), lane, field)
+    assert (str(again), again.env_index, again.field) == (str(caught.value), env_index, field)
 
 
 def test_single_observation_errors_name_the_lane_they_are_told() -> None:
     encoder = encoder_for(spaces.Box(-1, 1, (2,)))
     with pytest.raises(ObservationError, match=r"^environment 7: observation must be finite, got nan at index \(0,\)"):
-        encoder.encode_single(np.array([np.nan, 0], np.float32), lane=7)
+        encoder.encode_single(np.array([np.nan, 0], np.float32), env_index=7)
     with pytest.raises(ObservationError, match=r"^environment 0: observation must have shape \[N, 2\], got \[1, 3\]"):
         encoder.encode_single(np.zeros(3, np.float32))
 

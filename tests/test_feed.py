@@ -1,8 +1,8 @@
 """Feeds: what reaches the learner, when, and with which weight.
 
-Mutants that these tests kill: an idle lane that carries a λ-return across its pause; rows of the last rollout that show
-through; a sample drawn one step early or late; a period that is forgotten when several lanes step at once; priorities
-given to the wrong steps; a rollout saved half collected.
+Mutants that these tests kill: an idle environment that carries a λ-return across its pause; rows of the last rollout
+that show through; a sample drawn one step early or late; a period that is forgotten when several environments step at
+once; priorities given to the wrong steps; a rollout saved half collected.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from neuralq.feed import OnlineFeed, ReplayFeed, RolloutFeed, Sample
-from neuralq.interact import Interaction, Step
 from neuralq.learners import OnlineLearner, OnlineSettings, RolloutLearner, RolloutSettings
+from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import TableQ
 from neuralq.q.engine import Loss, TorchEngine
-from neuralq.replay import Prioritised, ReplayBuffer
+from neuralq.runs.stream import Interaction, Step
+from neuralq.runs.stream.experience import ReplayExperience, RolloutExperience, Sample, StepExperience
 from neuralq.types import Transition
 
 LENGTHS = (3, 1, 4, 2)
@@ -30,15 +30,15 @@ GAMMA, N, T = 0.9, 3, 12
 
 
 class Corridor(gym.Env[Any, Any]):
-    """Episodes of scripted lengths; every other one is cut off by a time limit. States never repeat within a lane."""
+    """Episodes of scripted lengths; every other one is cut off by a time limit. No environment repeats a state."""
 
-    def __init__(self, lane: int) -> None:
+    def __init__(self, env_index: int) -> None:
         self.observation_space = spaces.Discrete(1000)
         self.action_space = spaces.Discrete(2)
-        self.lane, self.episode, self.t, self.clock = lane, lane, 0, 0
+        self.env_index, self.episode, self.t, self.clock = env_index, env_index, 0, 0
 
     def _state(self) -> int:
-        return 300 * self.lane + self.clock
+        return 300 * self.env_index + self.clock
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
         self.episode, self.t, self.clock = self.episode + 1, 0, self.clock + 1
@@ -47,11 +47,17 @@ class Corridor(gym.Env[Any, Any]):
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         self.t, self.clock = self.t + 1, self.clock + 1
         ends, cut_off = self.t == LENGTHS[self.episode % 4], self.episode % 2 == 0
-        return self._state(), float(np.sin(self.clock + self.lane)) + action, ends and not cut_off, ends and cut_off, {}
+        return (
+            self._state(),
+            float(np.sin(self.clock + self.env_index)) + action,
+            ends and not cut_off,
+            ends and cut_off,
+            {},
+        )
 
 
-def stream_of(mode: AutoresetMode, num_lanes: int = N) -> Interaction:
-    envs = SyncVectorEnv([lambda i=i: Corridor(i) for i in range(num_lanes)], autoreset_mode=mode)
+def stream_of(mode: AutoresetMode, num_envs: int = N) -> Interaction:
+    envs = SyncVectorEnv([lambda i=i: Corridor(i) for i in range(num_envs)], autoreset_mode=mode)
     return Interaction(envs, GAMMA, seed=0, as_index=True)
 
 
@@ -66,10 +72,10 @@ def learner_of(returns: str) -> RolloutLearner:
     return RolloutLearner(engine, settings, np.random.default_rng(0))
 
 
-def rollout_of(stream: Interaction, feed: RolloutFeed) -> Sample:
+def rollout_of(stream: Interaction, experience: RolloutExperience) -> Sample:
     while True:
-        feed.add(stream.step(act))
-        for sample in feed.draw():
+        experience.add(stream.step(act))
+        for sample in experience.draw():
             return sample
 
 
@@ -77,36 +83,38 @@ def rollout_of(stream: Interaction, feed: RolloutFeed) -> Sample:
 def test_returns_of_real_rows_are_those_of_a_stream_without_pauses(returns: str) -> None:
     learner = learner_of(returns)
     paused, plain = stream_of(AutoresetMode.NEXT_STEP), Lanes(stream_of(AutoresetMode.DISABLED))
-    feed = RolloutFeed(T, N, paused.spec)
+    experience = RolloutExperience(T, N, paused.spec)
     for _ in range(3):  # later rollouts are written over earlier ones
-        sample = rollout_of(paused, feed)
+        sample = rollout_of(paused, experience)
         assert sample.weight is not None
         held = sample.weight > 0
         assert 0 < int((~held).sum()) < T * N
         targets = learner.targets(sample.transition)
-        for lane in range(N):
-            rows = held[:, lane]
-            lane_only = sample.transition.map(lambda x, lane=lane, rows=rows: x[rows][:, lane : lane + 1])
-            wanted = plain.take(lane, int(rows.sum()))
+        for env_index in range(N):
+            rows = held[:, env_index]
+            lane_only = sample.transition.map(
+                lambda x, env_index=env_index, rows=rows: x[rows][:, env_index : env_index + 1]
+            )
+            wanted = plain.take(env_index, int(rows.sum()))
             for ours, theirs in zip(_fields(lane_only), _fields(wanted), strict=True):
                 assert torch.equal(ours, theirs)
-            torch.testing.assert_close(targets[rows, lane], learner.targets(wanted)[:, 0], rtol=0, atol=1e-12)
+            torch.testing.assert_close(targets[rows, env_index], learner.targets(wanted)[:, 0], rtol=0, atol=1e-12)
 
 
 class Lanes:
-    """Each lane's steps of a stream that never pauses, as many as are asked for."""
+    """Each environment's steps of a stream that never pauses, as many as are asked for."""
 
     def __init__(self, plain: Interaction) -> None:
         self.plain = plain
         self.waiting: list[list[Transition]] = [[] for _ in range(N)]
 
-    def take(self, lane: int, count: int) -> Transition:
-        """The next ``count`` steps of one lane, ``[count, 1]``."""
-        while len(self.waiting[lane]) < count:
+    def take(self, env_index: int, count: int) -> Transition:
+        """The next ``count`` steps of one environment, ``[count, 1]``."""
+        while len(self.waiting[env_index]) < count:
             step = self.plain.step(act)
             for i, queue in enumerate(self.waiting):
                 queue.append(step.transition.map(lambda x, i=i: x[i : i + 1]))
-        taken, self.waiting[lane] = self.waiting[lane][:count], self.waiting[lane][count:]
+        taken, self.waiting[env_index] = self.waiting[env_index][:count], self.waiting[env_index][count:]
         return Transition(*(torch.stack(list(field)) for field in zip(*map(_fields, taken), strict=True)))
 
 
@@ -116,46 +124,46 @@ def _fields(t: Transition) -> tuple[Tensor, ...]:
 
 def test_rows_without_experience_have_weight_zero_and_break_the_stream() -> None:
     stream = stream_of(AutoresetMode.NEXT_STEP)
-    feed = RolloutFeed(T, N, stream.spec)
+    experience = RolloutExperience(T, N, stream.spec)
     moved = np.zeros((T, N))
     for row in range(T):
-        assert feed.between_samples == (row == 0)
+        assert experience.between_samples == (row == 0)
         step = stream.step(act)
-        feed.add(step)
-        moved[row, step.lanes] = 1
+        experience.add(step)
+        moved[row, step.env_indices] = 1
         if row < T - 1:
-            assert list(feed.draw()) == []
+            assert list(experience.draw()) == []
             with pytest.raises(ValueError, match=rf"half collected \({row + 1} of {T} rows\)"):
-                feed.state_dict()
-    (sample,) = feed.draw()
+                experience.state_dict()
+    (sample,) = experience.draw()
     assert sample.weight is not None
     np.testing.assert_array_equal(sample.weight.numpy(), moved)
     idle = sample.weight == 0
     assert sample.transition.last_t[idle].all() and not sample.transition.discount_t[idle].any()
-    assert list(feed.draw()) == [] and feed.between_samples and feed.state_dict() == {}
+    assert list(experience.draw()) == [] and experience.between_samples and experience.state_dict() == {}
 
 
 def test_a_full_rollout_has_no_weights_and_keeps_double_precision() -> None:
     stream = stream_of(AutoresetMode.DISABLED)
-    sample = rollout_of(stream, RolloutFeed(T, N, stream.spec))
+    sample = rollout_of(stream, RolloutExperience(T, N, stream.spec))
     assert sample.weight is None
     assert sample.transition.r_t.dtype == sample.transition.discount_t.dtype == torch.float64
     assert set(sample.transition.discount_t.unique().tolist()) == {0.0, GAMMA}
 
 
-def steps_of(num_lanes: int, count: int) -> list[Step]:
-    stream = stream_of(AutoresetMode.DISABLED, num_lanes)
+def steps_of(num_envs: int, count: int) -> list[Step]:
+    stream = stream_of(AutoresetMode.DISABLED, num_envs)
     return [stream.step(act) for _ in range(count)]
 
 
-def replay_feed(num_lanes: int, *cadence: int, block_length: int = 1, prioritised: bool = False) -> ReplayFeed:
+def replay_feed(num_envs: int, *cadence: int, block_length: int = 1, prioritised: bool = False) -> ReplayExperience:
     settings = Prioritised(alpha=1.0, epsilon=1e-12) if prioritised else None
-    buffer = ReplayBuffer(300, (), np.int64, num_lanes=num_lanes, prioritised=settings)
-    return ReplayFeed(buffer, np.random.default_rng(0), 8, block_length, *cadence)
+    buffer = ReplayBuffer(300, (), np.int64, num_envs=num_envs, prioritised=settings)
+    return ReplayExperience(buffer, np.random.default_rng(0), 8, block_length, *cadence)
 
 
 @pytest.mark.parametrize(
-    ("num_lanes", "cadence", "wanted"),
+    ("num_envs", "cadence", "wanted"),
     [
         (1, (4, 1, 1), [0, 0, 0, 1, 1, 1, 1, 1]),
         (1, (4, 3, 2), [0, 0, 0, 2, 0, 0, 2, 0]),
@@ -165,35 +173,35 @@ def replay_feed(num_lanes: int, *cadence: int, block_length: int = 1, prioritise
         (2, (2, 5, 3), [3, 0, 0, 3, 0, 3]),  # due at 2, 7, 12
     ],
 )
-def test_samples_come_when_they_are_due(num_lanes: int, cadence: tuple[int, ...], wanted: list[int]) -> None:
-    feed = replay_feed(num_lanes, *cadence)
+def test_samples_come_when_they_are_due(num_envs: int, cadence: tuple[int, ...], wanted: list[int]) -> None:
+    experience = replay_feed(num_envs, *cadence)
     got = []
-    for step in steps_of(num_lanes, len(wanted)):
-        feed.add(step)
-        got.append(sum(1 for _ in feed.draw()))
-        assert feed.between_samples
+    for step in steps_of(num_envs, len(wanted)):
+        experience.add(step)
+        got.append(sum(1 for _ in experience.draw()))
+        assert experience.between_samples
     assert got == wanted
-    assert len(feed.buffer) == num_lanes * len(wanted)
+    assert len(experience.buffer) == num_envs * len(wanted)
 
 
 def test_what_is_drawn_is_what_was_added() -> None:
-    feed = replay_feed(3, 1, 1, 1)
+    experience = replay_feed(3, 1, 1, 1)
     added: dict[int, tuple[float, ...]] = {}
     for step in steps_of(3, 20):
-        feed.add(step)
+        experience.add(step)
         added |= {int(row[0]): tuple(map(float, row)) for row in zip(*_fields(step.transition), strict=True)}
-        for sample in feed.draw():
+        for sample in experience.draw():
             assert sample.weight is None and sample.indices is None
             for row in zip(*_fields(sample.transition), strict=True):
                 assert tuple(map(float, row)) == pytest.approx(added[int(row[0])], rel=1e-6)
 
 
 def test_blocks_are_consecutive_steps_of_one_lane() -> None:
-    feed = replay_feed(3, 12, 3, 1, block_length=4)
+    experience = replay_feed(3, 12, 3, 1, block_length=4)
     seen = 0
     for step in steps_of(3, 30):
-        feed.add(step)
-        for sample in feed.draw():
+        experience.add(step)
+        for sample in experience.draw():
             t, seen = sample.transition, seen + 1
             assert t.r_t.shape == (4, 2)
             goes_on = ~t.last_t[:-1]
@@ -203,15 +211,15 @@ def test_blocks_are_consecutive_steps_of_one_lane() -> None:
 
 
 def test_errors_come_back_as_the_priorities_of_the_steps_they_belong_to() -> None:
-    feed = replay_feed(1, 5, 100, 1, prioritised=True)
+    experience = replay_feed(1, 5, 100, 1, prioritised=True)
     for step in steps_of(1, 5):
-        feed.add(step)
-    (sample,) = feed.draw()
+        experience.add(step)
+    (sample,) = experience.draw()
     assert sample.weight is not None and sample.indices is not None
     # Only the step at index 2 was surprising; from now on it is what is drawn.
-    feed.buffer.update_priorities(np.arange(5), np.full(5, 1e-12))
-    feed.return_errors(Sample(sample.transition, sample.weight, np.array([2, 4])), torch.tensor([-7.0, 1e-12]))
-    assert set(feed.buffer.sample(32, np.random.default_rng(0)).indices.tolist()) == {2}
+    experience.buffer.update_priorities(np.arange(5), np.full(5, 1e-12))
+    experience.return_errors(Sample(sample.transition, sample.weight, np.array([2, 4])), torch.tensor([-7.0, 1e-12]))
+    assert set(experience.buffer.sample(32, np.random.default_rng(0)).indices.tolist()) == {2}
 
 
 def test_a_restored_replay_feed_draws_the_same() -> None:
@@ -233,32 +241,32 @@ def test_a_restored_replay_feed_draws_the_same() -> None:
 
 def test_the_online_feed_passes_every_step_once_with_pauses_left_out() -> None:
     stream = stream_of(AutoresetMode.NEXT_STEP)
-    feed = OnlineFeed(N, stream.spec)
+    experience = StepExperience(N, stream.spec)
     pauses = 0
     for _ in range(20):
         step = stream.step(act)
-        feed.add(step)
-        assert not feed.between_samples
-        (sample,) = feed.draw()
-        assert feed.between_samples and list(feed.draw()) == []
+        experience.add(step)
+        assert not experience.between_samples
+        (sample,) = experience.draw()
+        assert experience.between_samples and list(experience.draw()) == []
         weight = torch.ones(N) if sample.weight is None else sample.weight
-        assert torch.nonzero(weight)[:, 0].tolist() == step.lanes.tolist()
-        pauses += N - len(step.lanes)
+        assert torch.nonzero(weight)[:, 0].tolist() == step.env_indices.tolist()
+        pauses += N - len(step.env_indices)
         for ours, theirs in zip(_fields(sample.transition), _fields(step.transition), strict=True):
             assert torch.equal(ours[weight > 0], theirs)
     assert pauses > 5
 
 
 def test_traces_learn_the_same_with_and_without_pauses() -> None:
-    # Each lane alone, so that the order of updates is the same in both modes.
+    # Each environment alone, so that the order of updates is the same in both modes.
     weights = []
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
         stream = stream_of(mode, 1)
         learner = OnlineLearner(TorchEngine(TableQ(1000, 2), Loss()), OnlineSettings(step_size=0.5))
-        feed = OnlineFeed(1, stream.spec)
+        experience = StepExperience(1, stream.spec)
         while stream.num_steps < 40:
-            feed.add(stream.step(act))
-            for sample in feed.draw():
+            experience.add(stream.step(act))
+            for sample in experience.draw():
                 learner.update(sample.transition, sample.weight)
         weights.append(learner.engine.flat.values.clone())
     assert torch.equal(*weights)

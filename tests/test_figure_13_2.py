@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq.feed import RolloutFeed
-from neuralq.interact import Step
 from neuralq.learners import RolloutLearner
 from neuralq.q.engine import TorchEngine
-from neuralq.recipes import load, train, with_preset
-from neuralq.training import Diverged
+from neuralq.runs import load, train, with_preset
+from neuralq.runs.loop import Diverged
+from neuralq.runs.stream import Step
+from neuralq.runs.stream.experience import RolloutExperience
 
 # Figure 13.2, γ = 0.9, cells row by row with G at (0, 2): the values printed on the arrows. A move is worth γⁿ · 100,
 # n the moves to G after it.
@@ -89,13 +89,13 @@ def test_a_time_limit_changes_nothing(layout: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layout", ["table", "action-output"])
 def test_truncation_taken_for_termination_fails(layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    add = RolloutFeed.add
+    add = RolloutExperience.add
 
-    def merged(self: RolloutFeed, step: Step) -> None:
+    def merged(self: RolloutExperience, step: Step) -> None:
         step.transition.discount_t[step.transition.last_t] = 0.0
         add(self, step)
 
-    monkeypatch.setattr(RolloutFeed, "add", merged)
+    monkeypatch.setattr(RolloutExperience, "add", merged)
     assert largest_error(tmp_path, layout, 0, **SHORT) > 10
 
 

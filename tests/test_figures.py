@@ -17,21 +17,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuralq.lab.drawn import FIGURES, Curve, Drawing, Panel, png_of, svg_of
-from neuralq.lab.drawn.cures import (
+from neuralq.lab.figures import FIGURES, Curve, Drawing, Panel, png_of, svg_of
+from neuralq.lab.figures.cures import (
     figure_critical_curves,
     figure_representations,
     star_critical_lambda,
     star_critical_phi,
 )
-from neuralq.lab.drawn.fitted_grid import figure_fitted
-from neuralq.lab.drawn.hall import figure_hall, modal_sweeps, predicted_sweeps, sweeps_until
-from neuralq.lab.drawn.spiral import figure_spiral, spiral_updates
-from neuralq.lab.drawn.star import chain_moments, figure_11_2, figure_11_5, figure_11_6
-from neuralq.lab.drawn.states import figure_chattering, figure_kolter
+from neuralq.lab.figures.fitted_grid import figure_fitted
+from neuralq.lab.figures.hall import figure_hall, modal_sweeps, predicted_sweeps, sweeps_until
+from neuralq.lab.figures.spiral import figure_spiral, spiral_updates
+from neuralq.lab.figures.star import chain_moments, figure_11_2, figure_11_5, figure_11_6
+from neuralq.lab.figures.states import figure_chattering, figure_kolter
+from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import TD
-from neuralq.lab.moments import evolve, jumps
-from neuralq.lab.process import linear_process
+from neuralq.lab.verdicts.moments import evolve, jumps
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.walks import walk5
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from neuralq.exact import solve
-from neuralq.lab.fitted import fitted_iteration
-from neuralq.lab.fitted_diagnosis import diagnose_fitted
-from neuralq.lab.network_regressor import NetworkRegressor
-from neuralq.lab.regressors import (
+from neuralq.lab.fitted.diagnosis import diagnose_fitted
+from neuralq.lab.fitted.iteration import fitted_iteration
+from neuralq.lab.fitted.network import NetworkRegressor
+from neuralq.lab.fitted.regressors import (
     GridInterpolation,
     KernelSmoothing,
     LeastSquares,

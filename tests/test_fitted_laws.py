@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuralq.exact import solve
-from neuralq.lab.fitted import fitted_iteration, iterate, sweep_of_mdp, sweep_of_model
-from neuralq.lab.fitted_diagnosis import derived_mdp, hat_norm, is_averager, policy_growth
-from neuralq.lab.fitted_finite import evaluation_matrix, fitted_evaluation, fitted_q_iteration
-from neuralq.lab.grow_support import greedy_costs, grow_support
-from neuralq.lab.regressors import (
+from neuralq.lab.fitted.diagnosis import derived_mdp, hat_norm, is_averager, policy_growth
+from neuralq.lab.fitted.grow_support import greedy_costs, grow_support
+from neuralq.lab.fitted.iteration import fitted_iteration, iterate, sweep_of_mdp, sweep_of_model
+from neuralq.lab.fitted.regressors import (
     GridInterpolation,
     KernelSmoothing,
     LeastSquares,
@@ -25,6 +24,7 @@ from neuralq.lab.regressors import (
     StateAggregation,
     quadratic_features,
 )
+from neuralq.lab.methods.fitted_finite import evaluation_matrix, fitted_evaluation, fitted_q_iteration
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples.boyan_moore import car_on_the_hill, gridworld, puddle_world
 from neuralq_envs.counterexamples.continuous import ContinuousModel, grid_support, random_support, reachable_mdp

@@ -17,17 +17,17 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from neuralq.features import encoder_for
-from neuralq.interact import Interaction, make_vector_env
-from neuralq.learners.streaming_network import SingleRowNetwork
+from neuralq.learners.replay.buffer import ReplayBuffer
+from neuralq.learners.traces.single_row import SingleRowNetwork
 from neuralq.q import MLP, NAMED_BODIES, ActionOutputQ, Conv, SeparateQ, body_for
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.frames import channels_first
-from neuralq.recipes import RunConfig, train, with_preset
-from neuralq.recipes.build import build_q, build_session, make_envs
-from neuralq.recipes.config import config_from_dict
-from neuralq.recipes.games import make_single
-from neuralq.replay import ReplayBuffer
+from neuralq.runs import RunConfig, train, with_preset
+from neuralq.runs.recipe.build import build_q, build_session, make_envs
+from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.games import make_single
+from neuralq.runs.stream import Interaction, make_vector_env
+from neuralq.runs.stream.encoding import encoder_for
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq.interact import ObservationSpec
 from neuralq.learners import GradientSettings, HeadCorrection, TangentCorrection
 from neuralq.q import MLP, Conv, Custom
 from neuralq.q.engine import Loss, TorchEngine
-from neuralq.recipes import RunConfig, load, train
-from neuralq.recipes.build import build_q, build_session
-from neuralq.recipes.gradient import gradient_learner, started_at_zero
+from neuralq.runs import RunConfig, load, train
+from neuralq.runs.recipe.build import build_q, build_session
+from neuralq.runs.recipe.gradient import gradient_learner, started_at_zero
+from neuralq.runs.stream import ObservationSpec
 from neuralq.types import Transition
 
 

@@ -14,14 +14,13 @@ from typing import Any
 
 import pytest
 
-from neuralq import hooks
-from neuralq.cli import main
-from neuralq.hooks import ProgressBar, TensorBoard, own_hook
+from neuralq.apps.cli import main
+from neuralq.checks import MissingExtra
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
-from neuralq.recipes import RunConfig, train
-from neuralq.record import read_metrics
-from neuralq.report import MissingExtra
+from neuralq.runs import RunConfig, hooks, train
+from neuralq.runs.folder.run_folder import read_metrics
+from neuralq.runs.hooks import ProgressBar, TensorBoard, own_hook
 
 
 class Clock:

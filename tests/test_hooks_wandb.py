@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from neuralq.cli import main
-from neuralq.hooks import WeightsAndBiases
-from neuralq.report import MissingExtra
+from neuralq.apps.cli import main
+from neuralq.checks import MissingExtra
+from neuralq.runs.hooks import WeightsAndBiases
 
 
 class Record:

@@ -19,31 +19,33 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from neuralq.acting import epsilon_greedy_policy
-from neuralq.feed import ReplayFeed
-from neuralq.interact import EnvironmentFault, Interaction, Step, interact, make_vector_env
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MaskedQ, TableQ
-from neuralq.replay import ReplayBuffer
-from neuralq.snapshot import encode_env, restore_env
+from neuralq.runs.folder import encode_env, restore_env
+from neuralq.runs.stream import EnvironmentFault, Interaction, Step, interact, make_vector_env
+from neuralq.runs.stream.acting import epsilon_greedy_policy
+from neuralq.runs.stream.experience import ReplayExperience
 from neuralq.types import Transition
 
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
 GAMMA = 0.9
 NUM_ACTIONS = 3
 NUM_LANES = 3
-# Length of each episode and how it ends; lane i begins with entry i.
+# Length of each episode and how it ends; environment i begins with entry i.
 EPISODES = ((3, "terminated"), (1, "truncated"), (4, "truncated"), (1, "terminated"), (2, "both"))
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Episodes by a fixed script; the observation tells lane, episode, step and everything that was done so far."""
+    """Episodes by a fixed script; the observation tells environment, episode, step and all that was done so far."""
 
-    def __init__(self, lane: int = 0, kind: str = "box", reuse: bool = False, masked: bool = False, start: int = 0):
-        self.lane, self.kind, self.reuse, self.masked = lane, kind, reuse, masked
+    def __init__(
+        self, env_index: int = 0, kind: str = "box", reuse: bool = False, masked: bool = False, start: int = 0
+    ):
+        self.env_index, self.kind, self.reuse, self.masked = env_index, kind, reuse, masked
         x = spaces.Box(-np.inf, np.inf, (4,), np.float32)
         self.observation_space = x if kind == "box" else spaces.Dict({"x": x, "k": spaces.Discrete(2)})
         self.action_space = spaces.Discrete(NUM_ACTIONS, start=start)
-        self.episode, self.t, self.trail = lane - 1, 0, 0.0
+        self.episode, self.t, self.trail = env_index - 1, 0, 0.0
         self.buffer = np.zeros(4, np.float32)
         self.both: dict[str, Any] = {"x": self.buffer, "k": 0}
 
@@ -57,7 +59,7 @@ class Scripted(gym.Env[Any, Any]):
         return self.t == length and how != "truncated", self.t == length and how != "terminated"
 
     def look(self) -> tuple[Any, dict[str, Any]]:
-        self.buffer[:] = self.lane, self.episode, self.t, self.trail
+        self.buffer[:] = self.env_index, self.episode, self.t, self.trail
         x = self.buffer if self.reuse else self.buffer.copy()
         extra = {"action_mask": self.mask()} if self.masked else {}
         if self.kind == "box":
@@ -77,7 +79,7 @@ class Scripted(gym.Env[Any, Any]):
         assert not self.masked or self.mask()[index]
         self.t, self.trail = self.t + 1, 2 * self.trail + index
         observation, extra = self.look()
-        return observation, 0.1 * self.t + index + self.lane, *self.ends(), extra
+        return observation, 0.1 * self.t + index + self.env_index, *self.ends(), extra
 
 
 def choose(row: np.ndarray[Any, Any], masked: bool) -> int:
@@ -131,13 +133,13 @@ def stream_of(mode: AutoresetMode, **options: Any) -> Interaction:
 
 
 def lanes_of(steps: list[Step]) -> list[list[tuple[Any, ...]]]:
-    lanes: list[list[tuple[Any, ...]]] = [[] for _ in range(NUM_LANES)]
+    env_indices: list[list[tuple[Any, ...]]] = [[] for _ in range(NUM_LANES)]
     for step in steps:
         t = step.transition
         fields = (t.s_tm1, t.a_tm1, t.mu_tm1, t.r_t, t.discount_t, t.s_t, t.last_t)
-        for row, lane in enumerate(step.lanes):
-            lanes[lane].append(tuple(field[row].numpy() for field in fields))
-    return lanes
+        for row, env_index in enumerate(step.env_indices):
+            env_indices[env_index].append(tuple(field[row].numpy() for field in fields))
+    return env_indices
 
 
 def assert_same(got: list[tuple[Any, ...]], wanted: list[tuple[Any, ...]]) -> None:
@@ -164,14 +166,14 @@ def test_every_lane_equals_a_plain_loop(mode: AutoresetMode, options: dict[str, 
     stream = stream_of(mode, **options)
     masked = bool(options.get("masked"))
     steps = [stream.step(policy_for(masked)) for _ in range(40)]
-    for lane, got in enumerate(lanes_of(steps)):
-        rows, episodes = plain_loop(Scripted(lane, **options), len(got))
+    for env_index, got in enumerate(lanes_of(steps)):
+        rows, episodes = plain_loop(Scripted(env_index, **options), len(got))
         assert len(got) >= 25
         assert_same(got, rows)
-        told = [(e.episode_return, e.length) for step in steps for e in step.episodes if e.lane == lane]
+        told = [(e.episode_return, e.length) for step in steps for e in step.episodes if e.env_index == env_index]
         np.testing.assert_allclose(told, episodes[: len(told)], rtol=1e-12)
         assert len(told) == len(episodes)
-    assert stream.num_steps == sum(len(step.lanes) for step in steps)
+    assert stream.num_steps == sum(len(step.env_indices) for step in steps)
     assert {bool(x) for step in steps for x in step.transition.discount_t[step.transition.last_t] == 0} == {True, False}
 
 
@@ -180,15 +182,15 @@ def test_replay_contents_are_the_same_in_all_modes(options: dict[str, Any]) -> N
     contents = []
     for mode in MODES:
         stream = stream_of(mode, **options)
-        buffer = ReplayBuffer(NUM_LANES * 24, stream.spec.shape, stream.spec.dtype, num_lanes=NUM_LANES)
-        feed = ReplayFeed(buffer, np.random.default_rng(0), 8, 1, 10**6, 1, 1)
+        buffer = ReplayBuffer(NUM_LANES * 24, stream.spec.shape, stream.spec.dtype, num_envs=NUM_LANES)
+        experience = ReplayExperience(buffer, np.random.default_rng(0), 8, 1, 10**6, 1, 1)
         left = np.full(NUM_LANES, 24)
-        while left.any():  # stop each lane at the same number of steps: NEXT_STEP pauses, the others do not
+        while left.any():  # stop each environment at the same number of steps: NEXT_STEP pauses, the others do not
             step = stream.step(policy_for(bool(options.get("masked"))))
-            keep = left[step.lanes] > 0
-            left[step.lanes[keep]] -= 1
+            keep = left[step.env_indices] > 0
+            left[step.env_indices[keep]] -= 1
             if keep.any():
-                feed.add(Step(tuple(row[keep] for row in step.rows), step.lanes[keep], ()))
+                experience.add(Step(tuple(row[keep] for row in step.rows), step.env_indices[keep], ()))
         assert buffer.num_breaks == 0
         contents.append(flattened(buffer.state_dict()))
         sampled = buffer.sample(64, np.random.default_rng(1)).transition
@@ -225,17 +227,17 @@ def test_the_native_vectorised_cartpole_is_read_in_its_own_mode() -> None:
     kinds = set()
     for _ in range(60):
         step = stream.step(lambda s: (s[:, 2].gt(0).long(), torch.ones(len(s))))
-        for row, lane in enumerate(step.lanes):
+        for row, env_index in enumerate(step.env_indices):
             t = step.transition.map(lambda x, row=row: x[row].numpy())
-            if lane in before:
-                np.testing.assert_array_equal(t.s_tm1, before[lane])
-            before[lane] = t.s_t
+            if env_index in before:
+                np.testing.assert_array_equal(t.s_tm1, before[env_index])
+            before[env_index] = t.s_t
             # The world ends where the pole or the cart leaves its range, and only there.
             outside = abs(t.s_t[0]) > 2.4 or abs(t.s_t[2]) > 12 * np.pi / 180
             assert (t.discount_t == 0) == outside and (t.last_t or not outside)
             kinds.add((bool(t.last_t), bool(outside)))
             if t.last_t:
-                del before[lane]
+                del before[env_index]
             assert np.abs(t.s_tm1).max() < 4 and t.r_t == 1
     assert kinds >= {(False, False), (True, False)}
     assert {e.length for e in step.episodes} <= {12}
@@ -260,11 +262,11 @@ def test_discounts_outside_their_range_are_refused(gamma: float) -> None:
 
 
 class Faulty(Scripted):
-    """Breaks its contract in lane 1, in the second step of its second episode (or at that reset)."""
+    """Breaks its contract in environment 1, in the second step of its second episode (or at that reset)."""
 
-    def __init__(self, lane: int, fault: str) -> None:
-        super().__init__(lane)
-        self.fault = fault if lane == 1 else ""
+    def __init__(self, env_index: int, fault: str) -> None:
+        super().__init__(env_index)
+        self.fault = fault if env_index == 1 else ""
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:  # type: ignore[override]
         observation, reward, terminated, truncated, extra = super().step(action)
@@ -383,10 +385,10 @@ def test_a_mask_that_comes_late_is_refused_and_one_that_is_left_out_allows_every
     assert t.s_tm1[:, -3:].tolist() == [[0, 1, 0]] * 2 and t.s_t[:, -3:].tolist() == [[1, 1, 1]] * 2
 
 
-def mitchell(vectorised: bool, num_lanes: int) -> Any:
+def mitchell(vectorised: bool, num_envs: int) -> Any:
     if vectorised:
-        return gym.make_vec("neuralq/MitchellGrid-v0", num_envs=num_lanes, vectorization_mode="vector_entry_point")
-    return make_vector_env(lambda: gym.make("neuralq/MitchellGrid-v0"), num_lanes)
+        return gym.make_vec("neuralq/MitchellGrid-v0", num_envs=num_envs, vectorization_mode="vector_entry_point")
+    return make_vector_env(lambda: gym.make("neuralq/MitchellGrid-v0"), num_envs)
 
 
 @pytest.mark.parametrize("vectorised", [True, False])
@@ -450,8 +452,8 @@ def test_an_environment_inside_a_vector_wrapper_is_watched_as_well() -> None:
         SyncVectorEnv([lambda i=i: Scripted(i, reuse=True) for i in range(3)], autoreset_mode=AutoresetMode.SAME_STEP)
     )
     stream = Interaction(envs, GAMMA, 0)
-    for lane, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(30)])):
-        assert_same(got, plain_loop(Scripted(lane), len(got))[0])
+    for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(30)])):
+        assert_same(got, plain_loop(Scripted(env_index), len(got))[0])
 
 
 # --- the checks above, turned on planted mistakes --------------------------------------------------------------------
@@ -486,14 +488,14 @@ def test_planted_mistakes_are_found(mode: AutoresetMode, plant: Callable[[Intera
     stream = stream_of(mode)
     plant(stream)
     with pytest.raises(AssertionError):
-        for lane, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
-            assert_same(got, plain_loop(Scripted(lane), len(got))[0])
+        for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
+            assert_same(got, plain_loop(Scripted(env_index), len(got))[0])
 
 
 def test_without_copies_a_reused_array_spoils_same_steps_successor() -> None:
-    # What `Lane` is for: take it away and the comparison with the plain loop fails.
+    # What `SubEnv` is for: take it away and the comparison with the plain loop fails.
     stream = stream_of(AutoresetMode.SAME_STEP, reuse=True)
-    stream.envs.envs = [lane.env for lane in stream.envs.envs]  # type: ignore[attr-defined]
+    stream.envs.envs = [env_index.env for env_index in stream.envs.envs]  # type: ignore[attr-defined]
     with pytest.raises(AssertionError):
-        for lane, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
-            assert_same(got, plain_loop(Scripted(lane), len(got))[0])
+        for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
+            assert_same(got, plain_loop(Scripted(env_index), len(got))[0])

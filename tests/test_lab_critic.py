@@ -23,19 +23,19 @@ from scipy import sparse
 
 from neuralq.checks import check_whole
 from neuralq.exact import resolvent
-from neuralq.lab.advice import RunTraits
-from neuralq.lab.critical import scan
-from neuralq.lab.diagnose import diagnose
-from neuralq.lab.growth import fit_growth
-from neuralq.lab.jumps import jumps
+from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import METHODS, Expected, method
-from neuralq.lab.moments import mean_radius, second_moment_radius
-from neuralq.lab.monitor import DivergenceMonitor
-from neuralq.lab.piecewise import follow
-from neuralq.lab.prescribe import prescribe
-from neuralq.lab.process import linear_process
-from neuralq.lab.run import run
-from neuralq.lab.sampled import SampleDiagnosis
+from neuralq.lab.networks.sampled import SampleDiagnosis
+from neuralq.lab.trial import run
+from neuralq.lab.verdicts.critical import scan
+from neuralq.lab.verdicts.diagnosis import diagnose
+from neuralq.lab.verdicts.moments import mean_radius, second_moment_radius
+from neuralq.lab.verdicts.piecewise import follow
+from neuralq.lab.verdicts.remedies import prescribe
+from neuralq.lab.verdicts.update_maps import jumps
+from neuralq.lab.watch.advice import RunTraits
+from neuralq.lab.watch.growth import fit_growth
+from neuralq.lab.watch.monitor import DivergenceMonitor
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 from neuralq_envs.counterexamples.chains import stationary_distribution

@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuralq.lab.critical import CRITICAL_PARAMETERS, NoBoundary, critical, scan, stability_margin
 from neuralq.lab.methods import method
-from neuralq.lab.run import run
+from neuralq.lab.trial import run
+from neuralq.lab.verdicts.critical import CRITICAL_PARAMETERS, NoBoundary, critical, scan, stability_margin
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 
@@ -48,7 +48,7 @@ def test_two_boundaries_are_both_found() -> None:
 
 
 def test_a_narrow_window_between_two_points_is_found() -> None:
-    from neuralq.lab.critical import _crossings
+    from neuralq.lab.verdicts.critical import _crossings
 
     values = np.linspace(0, 1, 11)
 

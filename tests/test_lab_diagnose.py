@@ -18,13 +18,13 @@ import pytest
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from neuralq.lab.diagnose import diagnose
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.spectrum import first_crossing, flow_bound, limit_of, moving_spectrum
 from neuralq.lab.methods import TD, Expected, Method
-from neuralq.lab.piecewise import follow
 from neuralq.lab.problems import problem as named
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.spectrum import first_crossing, flow_bound, limit_of, moving_spectrum
-from neuralq.lab.verdicts import is_poor
+from neuralq.lab.verdicts.diagnosis import diagnose
+from neuralq.lab.verdicts.piecewise import follow
+from neuralq.lab.verdicts.words import is_poor
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 from neuralq_envs.counterexamples.baird import star_control
@@ -307,7 +307,9 @@ def test_prediction_is_training_on_500_problems() -> None:
 def test_redundant_and_turned_features_change_nothing(
     seed: int, sampling: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["neuralq.lab.diagnose"], "MOST_SCANNED", 0)  # bounds take time, and follow radii
+    monkeypatch.setattr(
+        sys.modules["neuralq.lab.verdicts.diagnosis"], "MOST_SCANNED", 0
+    )  # bounds take time, and follow radii
     problem, _ = garnet_problem(seed)
     problem = replace(problem, step_size=0.05)
     d = problem.num_weights

@@ -19,8 +19,10 @@ import numpy as np
 import pytest
 
 import neuralq.lab
-from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, Run, matrix, problem, run
-from neuralq.lab.matrix import ABSENT, NEUTRAL_BAND, Sampled, applies, outcome_of
+from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, Run, problem
+from neuralq.lab import comparison as matrix
+from neuralq.lab import trial as run
+from neuralq.lab.comparison import ABSENT, NEUTRAL_BAND, Sampled, applies, outcome_of
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 

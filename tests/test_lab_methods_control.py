@@ -13,10 +13,10 @@ import pytest
 from lab_laws import Floats, assert_law, process_of, uneven_problem
 from scipy import sparse
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods.chains import chain_of, epsilon_greedy, greedy_policy, greedy_values, solve_chain, visits_of
 from neuralq.lab.methods.control import Q_LEARNING, SARSA, piece_of_policy
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import stream
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem
 from neuralq_envs.counterexamples.baird import star_control

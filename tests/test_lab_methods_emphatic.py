@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from lab_laws import assert_law, assert_long_run, min_real, process_of
 
+from neuralq.lab.linear.process import linear_process
+from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods.emphatic import ETD, emphasis, expected_emphatic_run, follow_on, follow_on_second_moment
 from neuralq.lab.methods.td import TD
-from neuralq.lab.process import linear_process
-from neuralq.lab.sampling import stream
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.emphatic import emphatic
 

@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import Sample, sample_of_arcs, stream
 from neuralq.lab.methods import METHODS, Expected, Learner, method
 from neuralq.lab.methods.gq import greedy_rows
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import Sample, sample_of_arcs, stream
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 

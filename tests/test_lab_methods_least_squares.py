@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from lab_laws import Floats, process_of, radius
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import Sample, sample_of_arcs, stream
 from neuralq.lab.methods import Method
 from neuralq.lab.methods.least_squares import BRM, FITTED, FITTED_Q, LSPI, LSTD, lspi
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import Sample, sample_of_arcs, stream
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 from neuralq_envs.counterexamples.kolter import kolter

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from lab_laws import Floats, assert_law, assert_long_run, min_real, process_of
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import Sample, stream
 from neuralq.lab.methods import Method
 from neuralq.lab.methods.multistep import EXPECTED_SARSA, NAIVE_Q, NSTEP, RETRACE, TREE_BACKUP, VTRACE
 from neuralq.lab.methods.td import TD
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import Sample, stream
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.emphatic import emphatic
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import Expected, Learner, Method
 from neuralq.lab.methods.residual_adaptive import RESIDUAL_ADAPTIVE, least_phi
 from neuralq.lab.methods.td import RESIDUAL
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import stream
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 

@@ -13,12 +13,12 @@ import pytest
 from lab_laws import assert_law, mean_over_arcs, min_real, process_of, radius
 from numpy.typing import NDArray
 
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import Sample, sample_of_arcs
 from neuralq.lab.methods import method
 from neuralq.lab.methods.operators import covariance, cross
 from neuralq.lab.methods.targets import HARD_TARGET, POLYAK_TARGET, PROJECTED_TARGET, frozen_target_map
 from neuralq.lab.methods.td import TD
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import Sample, sample_of_arcs
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.kolter import critical_probability, kolter
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neuralq.lab import moments
-from neuralq.lab.jumps import Jumps, jumps
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import stream
+from neuralq.lab.linear.spectrum import first_crossing, visible_process
 from neuralq.lab.methods import TD, Method, method
-from neuralq.lab.moments import (
+from neuralq.lab.verdicts import moments
+from neuralq.lab.verdicts.moments import (
     evolve,
     growth_factors,
     mean_radius,
@@ -21,9 +23,7 @@ from neuralq.lab.moments import (
     second_moment_stable,
     steady_covariance,
 )
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import stream
-from neuralq.lab.spectrum import first_crossing, visible_process
+from neuralq.lab.verdicts.update_maps import Jumps, jumps
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 

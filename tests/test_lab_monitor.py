@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq import training
-from neuralq.feed import Sample
-from neuralq.lab.advice import RunTraits, advise
-from neuralq.lab.growth import fit_growth
-from neuralq.lab.monitor import DivergenceMonitor, DivergenceWarning
-from neuralq.lab.sampled import diagnose_sample
+from neuralq.lab.networks.sampled import diagnose_sample
+from neuralq.lab.watch.advice import RunTraits, advise
+from neuralq.lab.watch.growth import fit_growth
+from neuralq.lab.watch.monitor import DivergenceMonitor, DivergenceWarning
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP, ActionOutputQ, LinearQ, TableQ
-from neuralq.recipes import RunConfig, train
+from neuralq.runs import RunConfig, train
+from neuralq.runs import loop as training
+from neuralq.runs.stream.experience import Sample
 from neuralq.types import Transition
 from neuralq_envs.counterexamples import star
 
@@ -238,10 +238,10 @@ def learner_of(q: Any) -> Any:
 def test_the_bound_is_found_from_rewards_and_n_steps_are_seen_through() -> None:
     q = LinearQ(1, 1)
     one = DivergenceMonitor(TRAITS)
-    one.look(learner_of(q), Sample(transitions([[1.0]] * 2, [[1.0]] * 2, r=[0.5, -2.0])))
+    one.observe(learner_of(q), Sample(transitions([[1.0]] * 2, [[1.0]] * 2, r=[0.5, -2.0])))
     assert one.bound == pytest.approx(2.0 / 0.1)
     three = DivergenceMonitor(TRAITS)  # 1 + γ + γ² over three steps, discounted by γ³
-    three.look(learner_of(q), Sample(transitions([[1.0]] * 2, [[1.0]] * 2, r=1 + 0.9 + 0.81, discount=0.9**3)))
+    three.observe(learner_of(q), Sample(transitions([[1.0]] * 2, [[1.0]] * 2, r=1 + 0.9 + 0.81, discount=0.9**3)))
     assert three.bound == pytest.approx(1.0 / 0.1)
 
 
@@ -251,12 +251,12 @@ def test_padding_rows_are_not_looked_at_and_single_steps_are_collected() -> None
         q.weight.fill_(1.0)
     monitor = DivergenceMonitor(TRAITS, num_samples=8, every=1)
     padded = transitions([[1.0], [1e6]], [[1.0], [1e6]], r=[1.0, 1e6])
-    monitor.look(learner_of(q), Sample(padded, torch.tensor([1.0, 0.0])))
+    monitor.observe(learner_of(q), Sample(padded, torch.tensor([1.0, 0.0])))
     assert quiet(monitor, row(1)) == [] and monitor.bound == pytest.approx(10)
     assert monitor.report()["largest_value"] == 1.0 and monitor.diagnoses == []
-    monitor.look(learner_of(q), Sample(padded, torch.zeros(2)))  # nothing at all
+    monitor.observe(learner_of(q), Sample(padded, torch.zeros(2)))  # nothing at all
     for _ in range(7):
-        monitor.look(learner_of(q), Sample(transitions([[1.0]], [[0.5]], r=1.0)))
+        monitor.observe(learner_of(q), Sample(transitions([[1.0]], [[0.5]], r=1.0)))
         monitor(row(2))
     assert [one.num_samples for _, one in monitor.diagnoses] == [8]
 
@@ -267,7 +267,7 @@ def test_a_module_that_cannot_be_differentiated_this_way_stops_nothing() -> None
             return super().at(s, a) * (1.0 if float(s.sum()) > 0 else 2.0)
 
     monitor = DivergenceMonitor(TRAITS, every=1)
-    monitor.look(learner_of(Awkward(1, 1)), Sample(transitions([[1.0]] * 9, [[1.0]] * 9)))
+    monitor.observe(learner_of(Awkward(1, 1)), Sample(transitions([[1.0]] * 9, [[1.0]] * 9)))
     assert quiet(monitor, row(1)) == [] and monitor.unavailable is not None
     assert "could not be computed" in monitor.explain()
 
@@ -322,13 +322,13 @@ def test_only_hooks_that_look_are_shown_the_learner(tmp_path: Path) -> None:
     seen: list[Any] = []
 
     class Looker:
-        def look(self, learner: Any, sample: Any) -> None:
+        def observe(self, learner: Any, sample: Any) -> None:
             seen.append((learner.num_updates, sample.transition.a_tm1.shape))
 
         def __call__(self, row: Any) -> None:
             seen.append(row["kind"])
 
-    assert isinstance(Looker(), training.Onlooker) and not isinstance(print, training.Onlooker)
+    assert isinstance(Looker(), training.Observer) and not isinstance(print, training.Observer)
     train(CONFIGS["online"], tmp_path / "run", [Looker(), lambda row: None])
     assert seen[0] == (1, (1,)) and seen[1] == "train"  # what was learned from, then the row
     assert seen[-1] == "evaluation" and seen[-2] == (200, (1,))

@@ -19,11 +19,10 @@ from torch import nn
 
 from neuralq.exact import predict_expected_td, td_operator
 from neuralq.exact.evaluation import policy_process
-from neuralq.lab.expected import expected_backup, expected_td_step, local_growth, local_jacobian
-from neuralq.lab.networks import diagnose_network
-from neuralq.lab.problems import problem as problem_of
-from neuralq.lab.representations import PairLinearQ
-from neuralq.lab.tangent import (
+from neuralq.lab.networks.diagnosis import diagnose_network
+from neuralq.lab.networks.expected import expected_backup, expected_td_step, local_growth, local_jacobian
+from neuralq.lab.networks.representations import PairLinearQ
+from neuralq.lab.networks.tangent_kernel import (
     local_system,
     local_verdict,
     neural_tangent_kernel,
@@ -31,6 +30,7 @@ from neuralq.lab.tangent import (
     reduced_operator,
     value_jacobian,
 )
+from neuralq.lab.problems import problem as problem_of
 from neuralq.mdp import FiniteMDP
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, MaskedQ, SeparateQ, TableQ
 from neuralq_envs.counterexamples import Problem, star

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neuralq.lab.diagnose import diagnose
 from neuralq.lab.problems import garnet, garnet_skewed
+from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq_envs.counterexamples import Problem
 
 Floats = NDArray[np.float64]

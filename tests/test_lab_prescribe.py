@@ -11,9 +11,9 @@ import math
 import numpy as np
 import pytest
 
-from neuralq.lab.prescribe import Remedy, prescribe
 from neuralq.lab.problems import problem
-from neuralq.lab.run import run
+from neuralq.lab.trial import run
+from neuralq.lab.verdicts.remedies import Remedy, prescribe
 
 
 @pytest.fixture(scope="module", params=["baird", "emphatic"])

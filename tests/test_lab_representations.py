@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from neuralq.exact import solve
-from neuralq.lab.expected import expected_backup, expected_td_step
-from neuralq.lab.problems import problem as problem_of
-from neuralq.lab.representations import (
+from neuralq.lab.networks.expected import expected_backup, expected_td_step
+from neuralq.lab.networks.representations import (
     REPRESENTATIONS,
     PairLinearQ,
     predict_representations,
     run_representations,
 )
+from neuralq.lab.problems import problem as problem_of
 from neuralq.mdp import FiniteMDP
 from neuralq.q import MLP
 from neuralq_envs.counterexamples import Problem, star

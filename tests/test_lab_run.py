@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from neuralq.lab.linear.process import linear_process
+from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import METHODS
-from neuralq.lab.process import linear_process
-from neuralq.lab.run import affine_power, run
-from neuralq.lab.sampling import stream
+from neuralq.lab.trial import affine_power, run
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 

@@ -16,12 +16,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuralq.lab.critical import critical, scan, stability_margin
-from neuralq.lab.diagnose import diagnose
+from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import method
 from neuralq.lab.methods.emphatic import follow_on
-from neuralq.lab.process import linear_process
-from neuralq.lab.run import run
+from neuralq.lab.trial import run
+from neuralq.lab.verdicts.critical import critical, scan, stability_margin
+from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.hall import hall
 from neuralq_envs.counterexamples.w2w import w2w_single

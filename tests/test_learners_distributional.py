@@ -18,10 +18,10 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.learners import DistributionalLearner, ReplayLearner, ReplaySettings
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MLP, ActionOutputQ, CategoricalQ, Conv, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
 from neuralq.q.distributional import atoms, distribution_of
 from neuralq.q.engine import Loss, TorchEngine, make_engine
-from neuralq.replay import ReplayBuffer
 from neuralq.types import Transition
 
 F64 = torch.float64

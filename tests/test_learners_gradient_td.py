@@ -10,7 +10,7 @@ Four kinds of oracle, none of which shares code with the learners:
 Mutants that were tried, and die: the sign of the correction; the decay out of the state; the trace kept over
 ``last_t``; no cut at exploring actions; ρ also on the h² terms of the regression, left out of the trace, left out of c;
 β left out; the Hessian term left out, halved, of the other sign; no trace of h, or of ∇Q; rows of
-weight 0 that move traces; the mean over lanes for their sum; 0 · ∞ in such rows; the policy or
+weight 0 that move traces; the mean over environments for their sum; 0 · ∞ in such rows; the policy or
 its μ ignored; h of the other sign; state dicts without h, traces or decay.
 """
 
@@ -36,7 +36,7 @@ from neuralq.learners import (
     ResidualGradientSettings,
     TangentCorrection,
 )
-from neuralq.learners.differentiation import gradient_rows, module_parameters
+from neuralq.learners.gradient.differentiation import gradient_rows, module_parameters
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, FlatParameters, LinearQ, MaskedQ, SeparateQ, TableQ
 from neuralq.q.engine import Engine, Loss, TorchEngine, make_engine
 from neuralq.types import Transition
@@ -293,7 +293,7 @@ def correction_of(form: str, layout: str, engine: Engine) -> Any:
 
 
 def stream(layout: str, q: Any, control: bool, seed: int = 0) -> Transition:
-    """One lane ``[T]``: discounts vary, it terminates once, is truncated once, and explores four times."""
+    """One environment ``[T]``: discounts vary, it terminates once, is truncated once, and explores four times."""
     rng = np.random.default_rng(seed)
     states = rng.integers(NUM_STATES, size=LENGTH + 1)
     s_tm1, s_t = states[:-1], states[1:].copy()
@@ -318,24 +318,24 @@ def flat_gradient(value: Tensor, q: Any) -> Tensor:
                       for p, g in zip(parameters, found, strict=True)])  # fmt: skip
 
 
-def forward_errors(t: Transition, q: Any, v_t: Tensor, rho: Tensor, keep: Tensor, lambda_: float) -> Tensor:
+def forward_errors(t: Transition, q: Any, v_t: Tensor, rho: Tensor, trace_decay: Tensor, lambda_: float) -> Tensor:
     """D_k = ρ_k (δ_k + γ_k λ c_{k+1} D_{k+1}): how far each λ-return lies from its prediction, differentiable."""
     values = q.at(t.s_tm1, t.a_tm1)
     errors: list[Tensor] = []
     after = torch.zeros((), dtype=torch.float64)
     for k in reversed(range(LENGTH)):
         ends = k == LENGTH - 1 or bool(t.last_t[k])
-        onward = 0.0 if ends else t.discount_t[k] * lambda_ * keep[k + 1]
+        onward = 0.0 if ends else t.discount_t[k] * lambda_ * trace_decay[k + 1]
         after = rho[k] * (t.r_t[k] + t.discount_t[k] * v_t[k] - values[k] + onward * after)
         errors.insert(0, after)
     return torch.stack(errors)
 
 
 def forward_view(
-    t: Transition, q: Any, correction: Any, v_t: Tensor, rho: Tensor, keep: Tensor, s: GradientTDSettings
+    t: Transition, q: Any, correction: Any, v_t: Tensor, rho: Tensor, trace_decay: Tensor, s: GradientTDSettings
 ) -> Any:
     """The sum of all increments with every weight held fixed, from scalars that autograd differentiates."""
-    errors = forward_errors(t, q, v_t, rho, keep, s.lambda_)
+    errors = forward_errors(t, q, v_t, rho, trace_decay, s.lambda_)
     values = q.at(t.s_tm1, t.a_tm1)
     if isinstance(correction, TangentCorrection):
         # ½ MSPBE = maxₕ D·h − ½ h², and its gradient is that of the bracket, at h held fixed (the tangent space turns).
@@ -378,9 +378,9 @@ def test_forward_view_equals_backward_view_for_control(form: str, layout: str, m
     correction, t = correction_of(form, layout, engine), stream(layout, q, control=True)
     chosen = GradientTDSettings(method, 0.8, 0.3, 0.2, 0.7, cut)
     one = torch.ones(LENGTH, dtype=torch.float64)
-    keep = one if cut == "naive" else rules.is_greedy(q.all(t.s_tm1), t.a_tm1).double()
-    assert keep.sum() == (10 if cut == "naive" else 6)
-    expected = forward_view(t, q, correction, q.all(t.s_t).amax(-1), one, keep, chosen)
+    trace_decay = one if cut == "naive" else rules.is_greedy(q.all(t.s_tm1), t.a_tm1).double()
+    assert trace_decay.sum() == (10 if cut == "naive" else 6)
+    expected = forward_view(t, q, correction, q.all(t.s_t).amax(-1), one, trace_decay, chosen)
     found = backward_view(GradientQLearner(engine, correction, chosen), t)
     torch.testing.assert_close(found[0], expected[0], rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(found[1], expected[1], rtol=1e-10, atol=1e-10)
@@ -411,9 +411,9 @@ def test_forward_view_equals_backward_view_for_a_target_policy(layout: str) -> N
     def policy(values: Tensor) -> Tensor:
         return rules.epsilon_greedy(values, 0.3)
 
-    keep = policy(q.all(t.s_tm1)).detach().gather(-1, t.a_tm1[:, None])[:, 0] / t.mu_tm1
+    trace_decay = policy(q.all(t.s_tm1)).detach().gather(-1, t.a_tm1[:, None])[:, 0] / t.mu_tm1
     v_t = (policy(q.all(t.s_t).detach()) * q.all(t.s_t)).sum(-1)
-    expected = forward_view(t, q, correction, v_t, torch.ones_like(keep), keep, chosen)
+    expected = forward_view(t, q, correction, v_t, torch.ones_like(trace_decay), trace_decay, chosen)
     found = backward_view(GradientQLearner(engine, correction, chosen, policy=policy), t)
     torch.testing.assert_close(found[0], expected[0], rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(found[1], expected[1], rtol=1e-10, atol=1e-10)
@@ -426,11 +426,11 @@ def test_lanes_are_learners_of_their_own_and_rows_of_weight_0_are_no_experience(
     chosen = GradientTDSettings("tdc", 0.8, 0.3, 0.2, 0.7)
     streams = [stream("action-output", engine.q, True, seed) for seed in (1, 2)]
     alone = [backward_view(GradientQLearner(engine, correction, chosen), t) for t in streams]
-    both = GradientQLearner(engine, correction, chosen, num_lanes=2)
+    both = GradientQLearner(engine, correction, chosen, num_envs=2)
     total: Any = 0.0
     total_h: Any = 0.0
     blank = streams[0].map(lambda x: x[4:5])
-    # The second lane starts one step later, and the first has ended by then.
+    # The second environment starts one step later, and the first has ended by then.
     for k in range(LENGTH + 1):
         halves = [streams[0].map(lambda x, k=k: x[k : k + 1]) if k < LENGTH else blank,
                   streams[1].map(lambda x, k=k: x[k - 1 : k]) if k else blank]  # fmt: skip
@@ -614,7 +614,7 @@ def test_refusals_name_the_way_out() -> None:
         GradientPredictionLearner(single, TangentCorrection(single), GradientTDSettings(cut="naive"))
     with pytest.raises(ValueError, match="importance ratio cuts"):
         GradientQLearner(many, TangentCorrection(many), GradientTDSettings(cut="naive"), policy=rules.greedy)
-    with pytest.raises(ValueError, match="set num_lanes"):
+    with pytest.raises(ValueError, match="set num_envs"):
         GradientQLearner(single, TangentCorrection(single), GradientTDSettings()).update(star_rows([2, 3], [1, 1]))
     with pytest.raises(ValueError, match="the network it was saved with"):
         TangentCorrection(single).load(torch.zeros(4))

@@ -56,7 +56,7 @@ def observe(layout: str, states: Tensor) -> Tensor:
 
 
 def stream(layout: str, engine: Engine, scenario: str, seed: int = 0) -> Transition:
-    """One lane ``[T]`` in which only the named thing happens; discounts vary from step to step."""
+    """One environment ``[T]`` in which only the named thing happens; discounts vary from step to step."""
     rng = np.random.default_rng([seed, SCENARIOS.index(scenario)])
     everything = scenario == "everything"
     states = torch.from_numpy(rng.integers(NUM_STATES, size=LENGTH + 1))
@@ -194,7 +194,9 @@ def test_the_learner_with_its_own_drop_taken_out_fails(monkeypatch: pytest.Monke
     t = stream("linear", engine, "truncation")
     learner = OnlineLearner(engine, settings())
     close = learner._core.traces.close
-    monkeypatch.setattr(learner._core.traces, "close", lambda lane, d, v, last: close(lane, d, v, last & False))
+    monkeypatch.setattr(
+        learner._core.traces, "close", lambda env_index, d, v, last: close(env_index, d, v, last & False)
+    )
     assert float((frozen_sum(learner, t) - forward(t, copy.deepcopy(engine.q))).abs().max()) > 1e-3
 
 
@@ -360,7 +362,7 @@ def test_lanes_add_up_and_keep_their_own_traces(layout: str, trace: str) -> None
         return  # refused, see above
     engine = engine_of(layout)
     t = lanes_of(layout, engine, 3)
-    together = OnlineLearner(engine, settings(trace=trace), num_lanes=3)
+    together = OnlineLearner(engine, settings(trace=trace), num_envs=3)
     alone = [OnlineLearner(engine, settings(trace=trace)) for _ in range(3)]
     for k in range(LENGTH):
         row = t.map(lambda x, k=k: x[k])
@@ -374,7 +376,7 @@ def test_lanes_add_up_and_keep_their_own_traces(layout: str, trace: str) -> None
 def test_a_lane_of_weight_zero_neither_learns_nor_loses_its_trace(layout: str) -> None:
     engine = engine_of(layout)
     t = lanes_of(layout, engine, 2)
-    plain, pausing = (OnlineLearner(engine, settings(), num_lanes=2) for _ in range(2))
+    plain, pausing = (OnlineLearner(engine, settings(), num_envs=2) for _ in range(2))
     for k in range(4):
         row = t.map(lambda x, k=k: x[k])
         wanted = plain.increment(row)[0]

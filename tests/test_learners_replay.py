@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from neuralq.learners import ReplayLearner, ReplaySettings
+from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
 from neuralq.q.engine import Engine, Loss, make_engine
-from neuralq.replay import Prioritised, ReplayBuffer
 from neuralq.types import Transition
 
 LAYOUTS = ["table", "linear", "action-input", "separate", "action-output"]
@@ -83,17 +83,17 @@ def test_single_samples_get_the_target_of_their_rule(layout: str, rule: str) -> 
 
 
 @torch.no_grad()
-def defined_block_return(t: Transition, q: Any, lambda_: float, watkins: bool, row: int, lane: int) -> float:
+def defined_block_return(t: Transition, q: Any, lambda_: float, watkins: bool, row: int, env_index: int) -> float:
     """λ-return of one row of a block, from the n-step returns and their weights."""
     total, so_far, factor, weight = 0.0, 0.0, 1.0, 1.0
     for k in range(row, len(t.r_t)):
-        so_far += factor * float(t.r_t[k, lane])
-        factor *= float(t.discount_t[k, lane])
-        n_step = so_far + factor * float(q.all(t.s_t[k, lane]).max())
-        cut = k == len(t.r_t) - 1 or bool(t.last_t[k, lane])
+        so_far += factor * float(t.r_t[k, env_index])
+        factor *= float(t.discount_t[k, env_index])
+        n_step = so_far + factor * float(q.all(t.s_t[k, env_index]).max())
+        cut = k == len(t.r_t) - 1 or bool(t.last_t[k, env_index])
         if watkins and not cut:
-            values = q.all(t.s_tm1[k + 1, lane])
-            cut = bool(values[t.a_tm1[k + 1, lane]] < values.max())
+            values = q.all(t.s_tm1[k + 1, env_index])
+            cut = bool(values[t.a_tm1[k + 1, env_index]] < values.max())
         if cut:
             return total + weight * n_step
         total, weight = total + weight * (1 - lambda_) * n_step, weight * lambda_

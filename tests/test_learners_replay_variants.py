@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq import checkpoint
 from neuralq.learners import DistributionalLearner, DQRCLearner, DQRCSettings, ReplayLearner, ReplaySettings
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MLP, ActionOutputQ, CategoricalQ, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
 from neuralq.q.engine import Loss, MlpEngine, TorchEngine, make_engine
-from neuralq.recipes import Run, RunConfig, load, resume, train
-from neuralq.recipes.build import build_session
-from neuralq.recipes.config import config_from_dict, config_to_dict
-from neuralq.recipes.replay import replay_learner
-from neuralq.record import read_metrics
-from neuralq.replay import ReplayBuffer
+from neuralq.runs import Run, RunConfig, load, resume, train
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.run_folder import read_metrics
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.recipe.config import config_from_dict, config_to_dict
+from neuralq.runs.recipe.replay import replay_learner
 from neuralq.types import Transition
 
 F64 = torch.float64

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neuralq.learners import ResidualGradientLearner, ResidualGradientSettings
-from neuralq.learners.residual_gradient import adaptive_phi
+from neuralq.learners.gradient.residual import adaptive_phi
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
 from neuralq.q.engine import Engine, Loss, TorchEngine, make_engine
 from neuralq.types import Transition

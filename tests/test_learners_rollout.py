@@ -65,8 +65,8 @@ def rollout(layout: str, engine: Engine, scenario: str) -> Transition:
     a = engine.all(observe(layout, s_tm1)).argmax(-1)
     if scenario == "exploring" or everything:
         explores = torch.zeros(T, N, dtype=torch.bool)
-        for t, lane in ((0, 1), (3, 0), (3, 1), (7, 2), (8, 2)):
-            explores[t, lane] = True
+        for t, env_index in ((0, 1), (3, 0), (3, 1), (7, 2), (8, 2)):
+            explores[t, env_index] = True
         a = torch.where(explores, (a + 1) % NUM_ACTIONS, a)
     r = torch.from_numpy(rng.normal(size=(T, N)))
     one = torch.ones(T, N, dtype=torch.float64)
@@ -74,23 +74,25 @@ def rollout(layout: str, engine: Engine, scenario: str) -> Transition:
     return Transition(observe(layout, s_tm1), a, one, r, d, observe(layout, s_t), end)
 
 
-def defined_return(t: Transition, q: Any, lambda_: float, watkins: bool, row: int, lane: int, plant: str = "") -> float:
+def defined_return(
+    t: Transition, q: Any, lambda_: float, watkins: bool, row: int, env_index: int, plant: str = ""
+) -> float:
     """(1-λ) Σ λⁿ⁻¹ Q⁽ⁿ⁾ + λᴺ⁻¹ Q⁽ᴺ⁾, N where the stream breaks, an exploring action follows or the rollout ends."""
 
     def value(k: int) -> float:
         source = min(k + 1, T - 1) if plant == "wrong bootstrap" and k == T - 2 else k
-        return float(q.all(t.s_t[source, lane]).max())
+        return float(q.all(t.s_t[source, env_index]).max())
 
     def explores(k: int) -> bool:
-        values = q.all(t.s_tm1[k, lane])
-        return bool(values[t.a_tm1[k, lane]] < values.max())
+        values = q.all(t.s_tm1[k, env_index])
+        return bool(values[t.a_tm1[k, env_index]] < values.max())
 
     total, so_far, factor, weight, k = 0.0, 0.0, 1.0, 1.0, row
     while True:
-        discount, last = float(t.discount_t[k, lane]), bool(t.last_t[k, lane])
+        discount, last = float(t.discount_t[k, env_index]), bool(t.last_t[k, env_index])
         if plant == "truncation as termination" and last:
             discount = 0.0
-        so_far += factor * float(t.r_t[k, lane])
+        so_far += factor * float(t.r_t[k, env_index])
         factor *= discount
         n_step = so_far + factor * value(k)
         cut = k == T - 1 or (last and plant != "across last")
@@ -200,11 +202,11 @@ def test_rows_of_weight_zero_have_no_influence(layout: str) -> None:
         engine = engine_of(layout)
         t = rollout(layout, engine, "everything")
         weight = torch.ones(T, N)
-        for row, lane in ((5, 0), (6, 2)):
-            weight[row, lane] = 0
-            t.r_t[row, lane] = garbage
-            t.discount_t[row, lane], t.last_t[row, lane] = 0.0, True
-            t.s_tm1[row, lane] = t.s_tm1[row, lane] * (0 if garbage else 1)
+        for row, env_index in ((5, 0), (6, 2)):
+            weight[row, env_index] = 0
+            t.r_t[row, env_index] = garbage
+            t.discount_t[row, env_index], t.last_t[row, env_index] = 0.0, True
+            t.s_tm1[row, env_index] = t.s_tm1[row, env_index] * (0 if garbage else 1)
         q, before = copy.deepcopy(engine.q), engine.flat.values.clone()
         targets = defined_returns(t, q, 0.7, False)
         learner_of(engine).update(t, weight)

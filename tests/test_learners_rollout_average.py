@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq import checkpoint
-from neuralq.best import load_best
 from neuralq.learners import RolloutLearner, RolloutSettings
-from neuralq.learners.average import IterateAverage, played_parameters, playing
+from neuralq.learners.averaging import IterateAverage, evaluating_with, evaluation_parameters
 from neuralq.q import MLP, ActionOutputQ, TableQ
 from neuralq.q.engine import Loss, TorchEngine, make_engine
-from neuralq.recipes import RunConfig, load, resume, train
-from neuralq.recipes.build import build_session
-from neuralq.record import read_metrics
+from neuralq.runs import RunConfig, load, resume, train
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.best import load_best
+from neuralq.runs.folder.run_folder import read_metrics
+from neuralq.runs.recipe.build import build_session
 from neuralq.types import Transition
 
 HALVES = {"num_envs": 1, "num_steps": 2, "num_minibatches": 1, "optimiser": "sgd", "learning_rate": 0.5}
@@ -76,10 +76,10 @@ def test_the_learner_averages_after_every_gradient_step() -> None:
     learner.update(pair())
     # from 0 half way to 8, twice: 4, 6; the average (½·4 + 6)/(½ + 1) = 16/3
     assert learner.engine.flat.values.tolist() == [6.0]
-    assert played_parameters(learner).tolist() == pytest.approx([16 / 3], rel=1e-15)
+    assert evaluation_parameters(learner).tolist() == pytest.approx([16 / 3], rel=1e-15)
     learner.update(pair())
     # 7, 7.5; (½³·4 + ½²·6 + ½·7 + 7.5)/(½³ + ½² + ½ + 1) = 13/1.875
-    assert played_parameters(learner).tolist() == pytest.approx([13 / 1.875], rel=1e-15)
+    assert evaluation_parameters(learner).tolist() == pytest.approx([13 / 1.875], rel=1e-15)
 
 
 def test_learning_never_sees_the_average() -> None:
@@ -87,10 +87,10 @@ def test_learning_never_sees_the_average() -> None:
     for learner in (plain, averaged):
         for _ in range(4):
             learner.update(pair())
-            with playing(learner):
+            with evaluating_with(learner):
                 pass
     assert torch.equal(plain.engine.flat.values, averaged.engine.flat.values)
-    assert played_parameters(plain) is plain.engine.flat.values, "without an average one plays what one learns"
+    assert evaluation_parameters(plain) is plain.engine.flat.values, "without an average one plays what one learns"
 
 
 @pytest.mark.parametrize("kind", ["torch", "compiled"])
@@ -102,7 +102,7 @@ def test_playing_swaps_for_the_block_only_even_if_it_fails(kind: str) -> None:
     start = engine.all(s).clone()
     engine.flat.values.add_(1.0)
     learned = engine.all(s).clone()
-    with pytest.raises(KeyError), playing(learner):
+    with pytest.raises(KeyError), evaluating_with(learner):
         assert torch.equal(engine.all(s), start)  # no step was taken: the average is still where it began
         raise KeyError
     assert torch.equal(engine.all(s), learned) and not torch.equal(start, learned)
@@ -116,8 +116,8 @@ def test_a_saved_learner_goes_on_with_its_average_bit_for_bit() -> None:
     two.rng.bit_generator.state = one.rng.bit_generator.state
     for learner in (one, two):
         learner.update(pair())
-    assert torch.equal(played_parameters(one), played_parameters(two))
-    assert not torch.equal(played_parameters(one), one.engine.flat.values)
+    assert torch.equal(evaluation_parameters(one), evaluation_parameters(two))
+    assert not torch.equal(evaluation_parameters(one), one.engine.flat.values)
 
 
 def test_refreshed_targets_are_those_of_the_moment() -> None:
@@ -160,7 +160,7 @@ def test_normalised_observations_travel_with_the_run(tmp_path: Path) -> None:
     agent = load(tmp_path / "run")
     assert agent.normalisation is not None
     counted = agent.normalisation.state_dict()["observation_count"].item()
-    assert counted >= 600, "one observation per step and lane"
+    assert counted >= 600, "one observation per step and environment"
     s = np.full(4, 0.5, np.float32)
     mean, squares = (agent.normalisation.state_dict()[f"observation_{name}"] for name in ("mean", "squares"))
     seen = (s - mean) / np.sqrt(squares / (counted - 1) + 1e-8)  # Welford (1962): the sample variance
@@ -219,13 +219,13 @@ class Watcher:
     """Keeps what the learner would play with at each row."""
 
     def __init__(self) -> None:
-        self.played: dict[int, torch.Tensor] = {}
+        self.evaluation_parameters: dict[int, torch.Tensor] = {}
 
     def look(self, learner: RolloutLearner, sample: object, /) -> None:
-        self._now = played_parameters(learner).clone()
+        self._now = evaluation_parameters(learner).clone()
 
     def __call__(self, row: Mapping[str, Any], /) -> None:
-        self.played[row["env_steps"]] = self._now
+        self.evaluation_parameters[row["env_steps"]] = self._now
 
 
 def test_evaluations_best_and_loaded_agents_play_the_average(tmp_path: Path) -> None:
@@ -240,12 +240,14 @@ def test_evaluations_best_and_loaded_agents_play_the_average(tmp_path: Path) -> 
     assert torch.equal(learned, torch.as_tensor(plain["descent"]["parameters"])), "experience and learning are the same"
     average = torch.as_tensor(state["average"]["values"])
 
-    def played(path: Path, best: bool) -> torch.Tensor:
+    def evaluation_parameters(path: Path, best: bool) -> torch.Tensor:
         q: Any = load(path, best).q
         return torch.cat([p.detach().reshape(-1) for p in q.parameters()])
 
-    assert torch.equal(played(tmp_path / "run", best=False), average) and not torch.equal(average, learned)
-    assert torch.equal(played(tmp_path / "plain", best=False), learned)
+    assert torch.equal(evaluation_parameters(tmp_path / "run", best=False), average) and not torch.equal(
+        average, learned
+    )
+    assert torch.equal(evaluation_parameters(tmp_path / "plain", best=False), learned)
     best = load_best(tmp_path / "run")
-    assert torch.equal(best.parameters, watcher.played[best.env_steps])
-    assert torch.equal(played(tmp_path / "run", best=True), best.parameters)
+    assert torch.equal(best.parameters, watcher.evaluation_parameters[best.env_steps])
+    assert torch.equal(evaluation_parameters(tmp_path / "run", best=True), best.parameters)

@@ -20,16 +20,17 @@ import torch
 from gymnasium import spaces
 
 from neuralq import rules
-from neuralq.acting import choose_epsilon_greedy, choose_greedy
-from neuralq.agent import Agent
-from neuralq.evaluation import evaluate_greedy
-from neuralq.interact import Interaction, Lane, legal_actions, make_vector_env
 from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
 from neuralq.q import MLP, MaskedQ
-from neuralq.recipes import RunConfig, build
-from neuralq.recipes.build import build_session
-from neuralq.snapshot import Resumability
-from neuralq.training import Session
+from neuralq.runs import RunConfig
+from neuralq.runs.agent import Agent
+from neuralq.runs.evaluation import evaluate_greedy
+from neuralq.runs.folder import Resumability
+from neuralq.runs.loop import Session
+from neuralq.runs.recipe import build
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.stream import Interaction, SubEnv, legal_actions, make_vector_env
+from neuralq.runs.stream.acting import choose_epsilon_greedy, choose_greedy
 
 LEGAL = np.array([[1, 1, 0], [0, 1, 0], [1, 1, 0]], np.int8)  # action 2 never, action 0 not in state 1
 LENGTH = 5
@@ -153,10 +154,10 @@ def tempt(session: Session, name: str) -> None:
 
 def fold(session: Session, num_steps: int) -> None:
     while session.stream.num_steps < num_steps:
-        session.feed.add(session.stream.step(session.policy))
-        for sample in session.feed.draw():
+        session.experience.add(session.stream.step(session.policy))
+        for sample in session.experience.draw():
             update = session.learner.update(sample.transition, sample.weight)
-            session.feed.return_errors(sample, update.errors)
+            session.experience.return_errors(sample, update.errors)
 
 
 def states(session: Session, kind: str) -> torch.Tensor:
@@ -248,11 +249,11 @@ def test_no_policy_takes_an_illegal_action_however_it_is_told(policy: str, told:
 
 @pytest.mark.parametrize("told", ["action_masks", "valid_action_mask"])
 def test_a_mask_method_says_what_is_legal_now_and_info_wins_over_it(told: str) -> None:
-    lane = Lane(gym.make("Tempting-v0", told=told), 0)
-    assert lane.reset(seed=0)[1]["action_mask"].tolist() == [True, True, False]
-    assert lane.step(0)[4]["action_mask"].tolist() == [False, True, False]
-    assert legal_actions(lane.env, {}).tolist() == [False, True, False]
-    assert legal_actions(lane.env, {"action_mask": [1, 1, 1]}) == [1, 1, 1]
+    env_index = SubEnv(gym.make("Tempting-v0", told=told), 0)
+    assert env_index.reset(seed=0)[1]["action_mask"].tolist() == [True, True, False]
+    assert env_index.step(0)[4]["action_mask"].tolist() == [False, True, False]
+    assert legal_actions(env_index.env, {}).tolist() == [False, True, False]
+    assert legal_actions(env_index.env, {"action_mask": [1, 1, 1]}) == [1, 1, 1]
     assert legal_actions(gym.make("CartPole-v1"), {}) is None
 
 
@@ -269,9 +270,9 @@ def test_a_mask_method_that_raises_names_the_environment() -> None:
 def test_a_mask_is_stored_in_the_kind_of_what_it_goes_with(kind: str, dtype: type) -> None:
     session = session_of("dqn", "action-output", kind, "action_masks")
     try:
-        assert session.stream.spec.dtype == dtype and session.feed.buffer.observation_dtype == dtype  # type: ignore[attr-defined]
+        assert session.stream.spec.dtype == dtype and session.experience.buffer.observation_dtype == dtype  # type: ignore[attr-defined]
         fold(session, 100)
-        stored = session.feed.buffer.sample(64, np.random.default_rng(0)).transition.s_tm1  # type: ignore[attr-defined]
+        stored = session.experience.buffer.sample(64, np.random.default_rng(0)).transition.s_tm1  # type: ignore[attr-defined]
         masks = stored[:, -3:].numpy().astype(int).tolist()
         assert {tuple(mask) for mask in masks} == {tuple(row) for row in LEGAL.tolist()}
         q = session.learner.engine.q

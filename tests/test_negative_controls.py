@@ -23,7 +23,6 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from neuralq.interact import Step
 from neuralq.learners import (
     GradientSettings,
     OnlineSettings,
@@ -31,9 +30,11 @@ from neuralq.learners import (
     RolloutSettings,
     StreamingSettings,
 )
-from neuralq.recipes import RunConfig, build
-from neuralq.recipes.build import build_session
-from neuralq.snapshot import Resumability
+from neuralq.runs import RunConfig
+from neuralq.runs.folder import Resumability
+from neuralq.runs.recipe import build
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.stream import Step
 
 GAMMA, NUM_STEPS = 0.8, 1_500
 MISTAKES = ("against the error", "ends not told", "truncation as termination")
@@ -132,8 +133,8 @@ def learned(name: str, mistake: str | None) -> Any:
                 discount = np.where(last, 0.0, discount)
             if mistake == "ends not told":
                 last = np.zeros_like(last)
-            session.feed.add(Step((s_tm1, a, mu, r, discount, s_t, last), step.lanes, step.episodes))
-            for sample in session.feed.draw():
+            session.experience.add(Step((s_tm1, a, mu, r, discount, s_t, last), step.env_indices, step.episodes))
+            for sample in session.experience.draw():
                 before = flat.clone()
                 session.learner.update(sample.transition, sample.weight)
                 if mistake == "against the error":

@@ -20,12 +20,13 @@ import pytest
 import torch
 from torch import nn
 
-from neuralq.feed import Sample
-from neuralq.interact import ObservationSpec
 from neuralq.learners import Learner
 from neuralq.q.engine import Loss, make_engine
-from neuralq.recipes import RunConfig, build
-from neuralq.recipes.config import config_from_dict
+from neuralq.runs import RunConfig
+from neuralq.runs.recipe import build
+from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.stream import ObservationSpec
+from neuralq.runs.stream.experience import Sample
 
 REPLAY = {"learning_starts": 8, "batch_size": 8, "capacity": 64, "target_period_updates": 1}
 BLOCKS = {**REPLAY, "block_length": 4, "batch_size": 8}
@@ -73,8 +74,8 @@ def samples_of(config: RunConfig, num_samples: int = 2) -> tuple[ObservationSpec
     samples: list[Sample] = []
     with contextlib.closing(build.build_session(config)) as session:
         while len(samples) < num_samples:
-            session.feed.add(session.stream.step(session.policy))
-            for sample in session.feed.draw():  # each is valid until the next
+            session.experience.add(session.stream.step(session.policy))
+            for sample in session.experience.draw():  # each is valid until the next
                 weight = None if sample.weight is None else sample.weight.clone()
                 samples.append(Sample(sample.transition.map(torch.clone), weight, sample.indices))
         return session.stream.spec, samples

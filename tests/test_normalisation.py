@@ -16,7 +16,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from neuralq.interact import Interaction, Normalisation, make_vector_env
+from neuralq.runs.stream import Interaction, Normalisation, make_vector_env
 
 ALWAYS = np.ones(1, bool)
 
@@ -126,7 +126,7 @@ def test_the_stream_is_seen_through_its_statistics(mode: AutoresetMode) -> None:
     left, taken = expected(), 0
     while taken < 8:
         step = stream.step(first)
-        if not len(step.lanes):  # NEXT_STEP restarts
+        if not len(step.env_indices):  # NEXT_STEP restarts
             continue
         taken += 1
         s_tm1, _, _, r_t, _, s_t, last = step.rows

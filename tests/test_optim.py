@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuralq.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 
 TORCH: dict[str, Any] = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "radam": torch.optim.RAdam}
 CONSTANTS = [(0.9, 0.999, 1e-8), (0.9, 0.99, 1e-5), (0.0, 0.5, 1e-3), (0.8, 0.0, 1e-2), (0.5, 0.9, 1.5e-4)]

@@ -20,12 +20,12 @@ pytest.importorskip("starlette", reason="the extra web is not installed")
 pytest.importorskip("httpx", reason="starlette's test client needs httpx")
 from starlette.testclient import TestClient
 
-from neuralq.backgammon import BackgammonAgent, ValueNetwork
-from neuralq.cli import main, play
-from neuralq.web import play_app
-from neuralq.web.play import Gone, Seats
-from neuralq.web.play_backgammon import backgammon
-from neuralq.web.play_tictactoe import tictactoe
+from neuralq.apps.cli import main, play
+from neuralq.apps.web import play_app
+from neuralq.apps.web.play import Gone, Seats
+from neuralq.apps.web.play_backgammon import backgammon
+from neuralq.apps.web.play_tictactoe import tictactoe
+from neuralq.systems.backgammon import BackgammonAgent, ValueNetwork
 from neuralq_envs.backgammon import Position
 
 # ---- backgammon at its seats
@@ -349,7 +349,7 @@ def test_a_missing_agent_says_how_to_train_one(capsys: pytest.CaptureFixture[str
 def test_the_command_serves_the_game_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Any
 ) -> None:
-    from neuralq.web import server
+    from neuralq.apps.web import server
 
     served = []
 

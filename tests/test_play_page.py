@@ -25,11 +25,11 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 import uvicorn
 from playwright.sync_api import sync_playwright
 
-from neuralq.backgammon import BackgammonAgent, Chances, RankedTurn, ValueNetwork
-from neuralq.web import play_app
-from neuralq.web.play import Offer
-from neuralq.web.play_backgammon import BackgammonGame, backgammon
-from neuralq.web.play_tictactoe import tictactoe
+from neuralq.apps.web import play_app
+from neuralq.apps.web.play import Offer
+from neuralq.apps.web.play_backgammon import BackgammonGame, backgammon
+from neuralq.apps.web.play_tictactoe import tictactoe
+from neuralq.systems.backgammon import BackgammonAgent, Chances, RankedTurn, ValueNetwork
 from neuralq_envs.backgammon import Position
 
 CHROMIUM = shutil.which("chromium")

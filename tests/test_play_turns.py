@@ -17,7 +17,7 @@ import pytest
 from backgammon_slowly import row
 
 pytest.importorskip("starlette", reason="the extra web is not installed")
-from neuralq.web.play_turns import BAR, OFF, PartialTurn, Step, WaysToPlay, notation
+from neuralq.apps.web.play_turns import BAR, OFF, PartialTurn, Step, WaysToPlay, notation
 from neuralq_envs.backgammon import Position
 
 Side = tuple[int, ...]  # checkers on the points 1 to 24 at 1 to 24 and on the bar at 25; at 0 those that are off

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuralq.q.products import MAX_PANEL, MIN_COLUMNS, multiply, suits
+from neuralq.q.kernels.products import MAX_PANEL, MIN_COLUMNS, multiply, suits
 
 
 def _placed(x: np.ndarray, at: int) -> np.ndarray:

@@ -23,10 +23,10 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from neuralq.features import OneHot, Pixels
-from neuralq.optim import FlatOptimiser, Optimiser
+from neuralq.learners.optim import FlatOptimiser, Optimiser
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
 from neuralq.q.engine import Loss, TorchEngine
+from neuralq.q.inputs import OneHot, Pixels
 from neuralq.types import QFunction
 
 A = 3

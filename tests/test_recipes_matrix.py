@@ -17,10 +17,11 @@ from gymnasium import spaces
 
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP, Conv
-from neuralq.recipes import RunConfig, build
-from neuralq.recipes.build import build_session
-from neuralq.recipes.config import LAYOUTS, LEARNERS, NETWORKS
-from neuralq.snapshot import Resumability
+from neuralq.runs import RunConfig
+from neuralq.runs.folder import Resumability
+from neuralq.runs.recipe import build
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.recipe.config import LAYOUTS, LEARNERS, NETWORKS
 
 NUM_STEPS = 200
 ENVS = {"discrete": "FrozenLake-v1", "vector": "CartPole-v1", "flags": "Flicker-v0", "bytes": "Flicker-v0"}
@@ -98,8 +99,8 @@ def test_it_trains_or_is_refused(layout: str, learner: str, kind: str) -> None:
         flat = session.learner.engine.flat.values
         before = flat.clone()
         while session.stream.num_steps < NUM_STEPS:
-            session.feed.add(session.stream.step(session.policy))
-            for sample in session.feed.draw():
+            session.experience.add(session.stream.step(session.policy))
+            for sample in session.experience.draw():
                 session.learner.update(sample.transition, sample.weight)
         assert bool(torch.isfinite(flat).all()) and session.learner.num_updates > 0
         # Frozen Lake may not have paid within 200 steps; then a table that starts at 0 has nothing to learn.
@@ -125,8 +126,8 @@ def test_distributions_go_with_layouts_of_several_outputs(layout: str, distribut
     session = build_session(config_of(layout, "replay", kind, replay=chosen))
     try:
         while session.learner.num_updates < 3:
-            session.feed.add(session.stream.step(session.policy))
-            for sample in session.feed.draw():
+            session.experience.add(session.stream.step(session.policy))
+            for sample in session.experience.draw():
                 session.learner.update(sample.transition, sample.weight)
         assert bool(torch.isfinite(session.learner.engine.flat.values).all())
     finally:

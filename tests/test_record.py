@@ -19,8 +19,8 @@ import pytest
 import torch
 import yaml
 
-from neuralq import record
-from neuralq.record import (
+from neuralq.runs.folder import run_folder as record
+from neuralq.runs.folder.run_folder import (
     RunFolder,
     RunFolderBusy,
     RunFolderError,
@@ -120,7 +120,7 @@ def test_a_second_writer_is_refused_with_folder_and_process_while_readers_are_no
 
 def test_the_lock_holds_between_processes_and_ends_with_a_kill(tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom neuralq.record import RunFolder\n"
+        "import sys\nfrom neuralq.runs.folder.run_folder import RunFolder\n"
         "run = RunFolder.create(sys.argv[1], config={}, seed=0)\nprint('locked', flush=True)\nsys.stdin.read()"
     )
     with subprocess.Popen(
@@ -261,6 +261,6 @@ def test_default_paths_are_one_plain_folder_name(env_id: str, name: str) -> None
 
 
 def test_reading_a_run_loads_no_torch() -> None:
-    code = "import sys, neuralq.record; sys.exit('torch' in sys.modules)"
+    code = "import sys, neuralq.runs.folder.run_folder; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert record.__all__ == sorted(record.__all__)

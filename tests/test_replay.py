@@ -21,8 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-import neuralq.memory
-from neuralq.replay import Batch, Prioritised, ReplayBuffer
+import neuralq.checks
+from neuralq.learners.replay.buffer import Batch, Prioritised, ReplayBuffer
 from neuralq.types import Transition
 
 NAMES = [f.name for f in fields(Transition)]
@@ -42,26 +42,28 @@ class Step:
 class Streams:
     """Random streams whose every observation is a number of its own, so that a wrong row cannot go unseen."""
 
-    def __init__(self, num_lanes: int, seed: int, p_end: float = 0.2) -> None:
+    def __init__(self, num_envs: int, seed: int, p_end: float = 0.2) -> None:
         self.rng, self.p_end = np.random.default_rng(seed), p_end
         self.counter = 0
-        self.current = [self.fresh() for _ in range(num_lanes)]
-        self.lanes: list[list[Step]] = [[] for _ in range(num_lanes)]
+        self.current = [self.fresh() for _ in range(num_envs)]
+        self.env_indices: list[list[Step]] = [[] for _ in range(num_envs)]
 
     def fresh(self) -> int:
         self.counter += 1
         return self.counter
 
-    def step(self, lane: int, *, broken: bool = False) -> Step:
+    def step(self, env_index: int, *, broken: bool = False) -> Step:
         last = bool(self.rng.random() < self.p_end)
         terminated = last and self.rng.random() < 0.5
         discount = 0.0 if terminated else float(self.rng.choice([0.5, 0.75, 1.0]))
         reward, mu = float(self.rng.integers(-8, 9)), float(self.rng.choice([0.25, 1.0]))
-        made = Step(self.current[lane], int(self.rng.integers(9)), mu, reward, discount, self.fresh(), last)
-        self.current[lane] = self.fresh() if last or broken else made.s_t
-        self.lanes[lane].append(made)
+        made = Step(self.current[env_index], int(self.rng.integers(9)), mu, reward, discount, self.fresh(), last)
+        self.current[env_index] = self.fresh() if last or broken else made.s_t
+        self.env_indices[env_index].append(made)
         if broken:
-            self.lanes[lane][-1] = Step(**{**made.__dict__, "last_t": True})  # what the buffer should make of it
+            self.env_indices[env_index][-1] = Step(
+                **{**made.__dict__, "last_t": True}
+            )  # what the buffer should make of it
         return made
 
 
@@ -78,14 +80,14 @@ def as_pairs(values: list[int]) -> np.ndarray[Any, Any]:
     return np.stack([np.array(values), -np.array(values)], axis=1).astype(np.float32)
 
 
-def filled(num_adds: int, num_lanes: int, capacity: int, seed: int, **options: Any) -> tuple[ReplayBuffer, Streams]:
-    """A buffer filled in uneven turns: each time some of the lanes, in random order."""
-    buffer = ReplayBuffer(capacity, (2,), np.float32, num_lanes=num_lanes, **options)
-    streams = Streams(num_lanes, seed)
+def filled(num_adds: int, num_envs: int, capacity: int, seed: int, **options: Any) -> tuple[ReplayBuffer, Streams]:
+    """A buffer filled in uneven turns: each time some of the environments, in random order."""
+    buffer = ReplayBuffer(capacity, (2,), np.float32, num_envs=num_envs, **options)
+    streams = Streams(num_envs, seed)
     turns = np.random.default_rng(seed + 1)
     for _ in range(num_adds):
-        lanes = turns.permutation(num_lanes)[: turns.integers(1, num_lanes + 1)]
-        buffer.add(stacked([streams.step(int(lane)) for lane in lanes], as_pairs), lanes)
+        env_indices = turns.permutation(num_envs)[: turns.integers(1, num_envs + 1)]
+        buffer.add(stacked([streams.step(int(env_index)) for env_index in env_indices], as_pairs), env_indices)
     return buffer, streams
 
 
@@ -110,25 +112,25 @@ def as_row(step: Step) -> tuple[float, ...]:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    num_lanes=st.integers(1, 4),
-    per_lane=st.integers(1, 9),
+    num_envs=st.integers(1, 4),
+    per_env=st.integers(1, 9),
     num_adds=st.integers(1, 40),
     n=st.integers(1, 5),
     seed=st.integers(0, 999),
 )
 def test_samples_are_the_n_step_transitions_of_the_held_steps(
-    num_lanes: int, per_lane: int, num_adds: int, n: int, seed: int
+    num_envs: int, per_env: int, num_adds: int, n: int, seed: int
 ) -> None:
-    buffer, streams = filled(num_adds, num_lanes, per_lane * num_lanes, seed, num_steps=n)
+    buffer, streams = filled(num_adds, num_envs, per_env * num_envs, seed, num_steps=n)
     expected = {
         as_row(n_step(stream, t, n))
-        for stream in streams.lanes
-        for t in range(max(0, len(stream) - per_lane), len(stream))
+        for stream in streams.env_indices
+        for t in range(max(0, len(stream) - per_env), len(stream))
     }
     batch = buffer.sample(600, np.random.default_rng(seed))
     assert torch.equal(batch.transition.s_t[:, 0], -batch.transition.s_t[:, 1])
     assert set(rows_of(batch.transition)) == expected  # every held step drawn, and nothing else
-    assert len(buffer) == sum(min(per_lane, len(stream)) for stream in streams.lanes)
+    assert len(buffer) == sum(min(per_env, len(stream)) for stream in streams.env_indices)
     assert buffer.num_breaks == 0
 
 
@@ -151,16 +153,16 @@ def test_termination_truncation_and_cursor_each_alone() -> None:
 
 
 @settings(max_examples=20, deadline=None)
-@given(num_lanes=st.integers(1, 3), length=st.integers(1, 6), num_adds=st.integers(6, 40), seed=st.integers(0, 999))
-def test_blocks_are_consecutive_steps_of_one_lane(num_lanes: int, length: int, num_adds: int, seed: int) -> None:
-    per_lane = 7
-    buffer, streams = filled(num_adds, num_lanes, per_lane * num_lanes, seed)
-    held = [stream[max(0, len(stream) - per_lane) :] for stream in streams.lanes]
+@given(num_envs=st.integers(1, 3), length=st.integers(1, 6), num_adds=st.integers(6, 40), seed=st.integers(0, 999))
+def test_blocks_are_consecutive_steps_of_one_lane(num_envs: int, length: int, num_adds: int, seed: int) -> None:
+    per_env = 7
+    buffer, streams = filled(num_adds, num_envs, per_env * num_envs, seed)
+    held = [stream[max(0, len(stream) - per_env) :] for stream in streams.env_indices]
     expected = {
         tuple(as_row(s) for s in stream[t : t + length]) for stream in held for t in range(len(stream) - length + 1)
     }
     if not expected:
-        with pytest.raises(ValueError, match="the fullest lane holds"):
+        with pytest.raises(ValueError, match="the fullest environment holds"):
             buffer.sample_blocks(4, length, np.random.default_rng(seed))
         return
     blocks = buffer.sample_blocks(300, length, np.random.default_rng(seed))
@@ -170,9 +172,9 @@ def test_blocks_are_consecutive_steps_of_one_lane(num_lanes: int, length: int, n
 
 
 def test_a_whole_rollout_is_stored_as_its_steps_one_by_one() -> None:
-    one, whole = (ReplayBuffer(30, (2,), np.float32, num_lanes=3) for _ in range(2))
+    one, whole = (ReplayBuffer(30, (2,), np.float32, num_envs=3) for _ in range(2))
     streams = Streams(3, seed=5)
-    rollout = [stacked([streams.step(lane) for lane in range(3)], as_pairs) for _ in range(17)]
+    rollout = [stacked([streams.step(env_index) for env_index in range(3)], as_pairs) for _ in range(17)]
     for step in rollout:
         one.add(step)
     whole.add(Transition(*(torch.stack([getattr(x, name) for x in rollout]) for name in NAMES)))
@@ -183,7 +185,7 @@ def test_a_stream_that_does_not_continue_is_marked_as_broken() -> None:
     buffer, streams = ReplayBuffer(50, (2,), np.float32, num_steps=3), Streams(1, 3, p_end=0.1)
     for t in range(40):
         buffer.add(stacked([streams.step(0, broken=t % 4 == 3 and t < 39)], as_pairs))
-    expected = {as_row(n_step(streams.lanes[0], t, 3)) for t in range(40)}
+    expected = {as_row(n_step(streams.env_indices[0], t, 3)) for t in range(40)}
     assert set(rows_of(buffer.sample(800, np.random.default_rng(0)).transition)) == expected
     assert buffer.num_breaks > 0
 
@@ -199,7 +201,7 @@ def test_large_observations_hold_what_they_promise(p_end: float) -> None:
     assert len(buffer) == {0.0: 64, 1.0: 36}.get(p_end, len(buffer)) >= 36
     expected = {
         (s.s_tm1 % 256, s.a_tm1, s.mu_tm1, s.r_t, s.discount_t, s.s_t % 256, s.last_t)
-        for s in streams.lanes[0][-len(buffer) :]
+        for s in streams.env_indices[0][-len(buffer) :]
     }
     got = buffer.sample(1000, np.random.default_rng(0)).transition
     assert (got.s_t == got.s_t[:, :1]).all()
@@ -241,7 +243,7 @@ def test_arrays_with_gaps_float64_rewards_and_gradients_are_stored_alike() -> No
 
 def test_uniform_samples_are_uniform_over_steps_of_uneven_lanes() -> None:
     buffer, streams = filled(30, 3, 60, seed=2)
-    held = [s.s_tm1 for stream in streams.lanes for s in stream[-20:]]
+    held = [s.s_tm1 for stream in streams.env_indices for s in stream[-20:]]
     drawn = buffer.sample(10_000, np.random.default_rng(0)).transition.s_tm1[:, 0].numpy().astype(int)
     counts = np.array([np.count_nonzero(drawn == s) for s in held])
     assert counts.sum() == 10_000
@@ -312,7 +314,7 @@ def test_steps_that_leave_early_cannot_be_drawn_by_priority() -> None:
 def test_state_continues_bit_for_bit(prioritised: Prioritised | None, num_adds: int) -> None:
     buffer, streams = filled(num_adds, 2, 20, seed=7, prioritised=prioritised, num_steps=2)
     learn(buffer, np.random.default_rng(1), 5)
-    other = ReplayBuffer(20, (2,), np.float32, num_lanes=2, prioritised=prioritised, num_steps=2)
+    other = ReplayBuffer(20, (2,), np.float32, num_envs=2, prioritised=prioritised, num_steps=2)
     other.load_state_dict(copy.deepcopy(buffer.state_dict()))
     more = [stacked([streams.step(0), streams.step(1)], as_pairs) for _ in range(30)]
     results = []
@@ -348,14 +350,14 @@ def assert_same_state(left: dict[str, Any], right: dict[str, Any]) -> None:
 
 def test_state_of_another_buffer_is_refused() -> None:
     state = ReplayBuffer(20, (2,), np.float32).state_dict()
-    for options in ({"capacity": 21}, {"observation_dtype": np.float64}, {"num_lanes": 2}):
+    for options in ({"capacity": 21}, {"observation_dtype": np.float64}, {"num_envs": 2}):
         arguments: dict[str, Any] = {"capacity": 20, "observation_shape": (2,), "observation_dtype": np.float32}
         with pytest.raises(ValueError, match="construct it alike"):
             ReplayBuffer(**(arguments | options)).load_state_dict(state)
 
 
 def test_what_does_not_fit_is_refused_before_allocating(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neuralq.memory, "available_bytes", lambda: 10**9)
+    monkeypatch.setattr(neuralq.checks, "available_bytes", lambda: 10**9)
     # 100,000 observations of 84·84·4 = 28,224 bytes, 112,500 rows: 3,175,200,000; and 32 bytes a step: 3,200,000.
     with pytest.raises(MemoryError, match=r"3,178,400,000 bytes .* 1,000,000,000 bytes .*memory_map="):
         ReplayBuffer(100_000, (84, 84, 4), np.uint8)
@@ -367,10 +369,10 @@ def test_what_does_not_fit_is_refused_before_allocating(monkeypatch: pytest.Monk
 
 
 def test_available_memory_is_the_tightest_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neuralq.memory, "_machine", lambda: 100)
-    monkeypatch.setattr(neuralq.memory, "_group_v2", lambda: 40)
-    monkeypatch.setattr(neuralq.memory, "_group_v1", lambda: None)
-    assert neuralq.memory.available_bytes() == 40
+    monkeypatch.setattr(neuralq.checks, "_machine", lambda: 100)
+    monkeypatch.setattr(neuralq.checks, "_group_v2", lambda: 40)
+    monkeypatch.setattr(neuralq.checks, "_group_v1", lambda: None)
+    assert neuralq.checks.available_bytes() == 40
 
 
 def test_a_memory_map_gives_the_same_samples_and_leaves_no_file(tmp_path: Path) -> None:
@@ -411,20 +413,20 @@ def good() -> dict[str, Any]:
         ({"s_tm1": torch.zeros(2, 3)}, r"s_tm1 must have shape \(2, 2\), got \(2, 3\)"),
         ({"s_t": torch.zeros(2, 2, dtype=torch.float64)}, "s_t must be float32, got float64"),
         ({"a_tm1": torch.zeros(2)}, "a_tm1 must be int64, got float32"),
-        ({"a_tm1": torch.zeros(3, dtype=torch.int64)}, "k = 2 lanes, got"),
+        ({"a_tm1": torch.zeros(3, dtype=torch.int64)}, "k = 2 environments, got"),
         ({"r_t": torch.zeros(2, 1)}, r"r_t must have shape \(2,\), got \(2, 1\)"),
         ({"r_t": torch.zeros(2, dtype=torch.int64)}, "r_t must be float32 or float64, got int64"),
         ({"last_t": torch.zeros(2)}, "last_t must be bool, got float32"),
-        ({"lanes": np.array([0, 2])}, r"lanes must lie in \[0, 2\), got 0 to 2"),
-        ({"lanes": np.array([0.0, 1.0])}, "lanes must be a row of int64"),
+        ({"environments": np.array([0, 2])}, r"environments must lie in \[0, 2\), got 0 to 2"),
+        ({"environments": np.array([0.0, 1.0])}, "environments must be a row of int64"),
     ],
 )
 def test_wrong_steps_are_refused_and_not_stored(change: dict[str, Any], message: str) -> None:
-    buffer = ReplayBuffer(10, (2,), np.float32, num_lanes=2)
+    buffer = ReplayBuffer(10, (2,), np.float32, num_envs=2)
     values = good() | change
-    lanes = values.pop("lanes", None)
+    env_indices = values.pop("environments", None)
     with pytest.raises(ValueError, match=message):
-        buffer.add(Transition(**values), lanes)
+        buffer.add(Transition(**values), env_indices)
     assert len(buffer) == 0
 
 
@@ -435,14 +437,14 @@ def test_a_wrong_single_step_is_refused() -> None:
         buffer.add_step(0, s, 0, 1.0, 0.0, 1.0, s.astype(np.float64), False)
     with pytest.raises(ValueError, match=r"s_tm1 must have shape \(1, 2\), got \(1, 3\)"):
         buffer.add_step(0, np.zeros(3, np.float32), 0, 1.0, 0.0, 1.0, s, False)
-    with pytest.raises(ValueError, match="lanes must lie"):
+    with pytest.raises(ValueError, match="environments must lie"):
         buffer.add_step(1, s, 0, 1.0, 0.0, 1.0, s, False)
     assert len(buffer) == 0
 
 
 def test_wrong_settings_and_calls_are_refused() -> None:
     rng = np.random.default_rng(0)
-    for options in ({"capacity": 0}, {"num_lanes": 0}, {"num_steps": 0}, {"observation_dtype": object}):
+    for options in ({"capacity": 0}, {"num_envs": 0}, {"num_steps": 0}, {"observation_dtype": object}):
         arguments: dict[str, Any] = {"capacity": 9, "observation_shape": (2,), "observation_dtype": np.float32}
         with pytest.raises(ValueError, match="must be"):
             ReplayBuffer(**(arguments | options))

@@ -22,8 +22,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from neuralq.report import (
-    MissingExtra,
+from neuralq.checks import MissingExtra
+from neuralq.runs.report import divergence as divergence_module
+from neuralq.runs.report import (
     divergence_svg,
     growth_table,
     learning_curve_svg,
@@ -33,8 +34,7 @@ from neuralq.report import (
     write_demo_report,
     write_report,
 )
-from neuralq.report import divergence as divergence_module
-from neuralq.report.readings import finite_series, first_not_finite, quartiles, thin
+from neuralq.runs.report.readings import finite_series, first_not_finite, quartiles, thin
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
@@ -50,7 +50,7 @@ class Outline(HTMLParser):
         self.references: list[str] = []
         self.outside: list[tuple[str, str]] = []
         self.text = ""
-        self.feed(page)
+        self.experience(page)
         self.close()
         assert not self.open, f"never closed: {self.open}"
 

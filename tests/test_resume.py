@@ -24,14 +24,14 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from neuralq import checkpoint
-from neuralq.cli import main
-from neuralq.interact import EnvironmentFault
+from neuralq.apps.cli import main
 from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP
-from neuralq.recipes import Run, RunConfig, resume, train
-from neuralq.record import RunFolder, RunFolderBusy, read_config, read_metrics
-from neuralq.training import Diverged
+from neuralq.runs import Run, RunConfig, resume, train
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.run_folder import RunFolder, RunFolderBusy, read_config, read_metrics
+from neuralq.runs.loop import Diverged
+from neuralq.runs.stream import EnvironmentFault
 
 GRID = "FrozenLake-v1"  # of finitely many states, and its episodes end
 CLOCKS = ("cpu_seconds", "wall_seconds", "steps_per_second")
@@ -153,7 +153,7 @@ SERVER = """
 import json, os, sys
 import torch
 torch.set_num_threads(1)
-from neuralq.cli import main
+from neuralq.apps.cli import main
 main(json.loads(sys.argv[1]))
 print("ready", flush=True)
 for line in sys.stdin:
@@ -441,7 +441,7 @@ def test_divergence_is_told_and_never_saved(case: str, tmp_path: Path) -> None:
         if row["env_steps"] >= 300:
             poison[0].learner.engine.flat.values[:] = torch.nan
 
-    from neuralq.recipes import run as recipe_run
+    from neuralq.runs import api as recipe_run
 
     build = recipe_run.build_session
     with pytest.MonkeyPatch.context() as patched:

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from neuralq.record import RunFolder
+from neuralq.runs.folder.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(path.name for path in (ROOT / "scripts").glob("*.py"))

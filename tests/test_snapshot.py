@@ -26,9 +26,8 @@ import torch
 from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from neuralq import checkpoint
 from neuralq.mdp import FiniteMDP
-from neuralq.snapshot import NotCopyable, encode_env, is_resumable, restore_env
+from neuralq.runs.folder import NotCopyable, checkpoint, encode_env, is_resumable, restore_env
 
 NEWEST_TAXI = max(name for name in gymnasium.registry if name.startswith("Taxi-v"))
 CLASSIC = ["CartPole-v1", NEWEST_TAXI, "FrozenLake-v1", "Blackjack-v1", "MountainCar-v0", "Acrobot-v1", "Pendulum-v1"]

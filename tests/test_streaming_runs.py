@@ -17,15 +17,15 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from neuralq import checkpoint
-from neuralq.cli import main
+from neuralq.apps.cli import main
 from neuralq.learners import StreamingLearner, StreamingSettings
-from neuralq.learners import streaming_kernels as kernels
+from neuralq.learners.traces import streaming_kernels as kernels
 from neuralq.q import MLP
-from neuralq.recipes import RunConfig, evaluate_run, load, resume, train, with_preset
-from neuralq.recipes.build import build_session, normalisation_for
-from neuralq.recipes.config import config_from_dict, config_to_dict
-from neuralq.record import read_config, read_metrics
+from neuralq.runs import RunConfig, evaluate_run, load, resume, train, with_preset
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.run_folder import read_config, read_metrics
+from neuralq.runs.recipe.build import build_session, normalisation_for
+from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 
 CLOCKS = ("cpu_seconds", "wall_seconds", "steps_per_second")
 BODY = MLP((8,), layer_norm=True, affine=False, activation="leaky_relu", sparsity=0.5)
@@ -120,8 +120,8 @@ def test_evaluations_see_what_the_learner_sees_and_teach_nothing() -> None:
     session = build_session(configured())
     try:
         for _ in range(50):
-            session.feed.add(session.stream.step(session.policy))
-            for sample in session.feed.draw():
+            session.experience.add(session.stream.step(session.policy))
+            for sample in session.experience.draw():
                 session.learner.update(sample.transition)
         before = {name: value.copy() for name, value in session.stream.normalisation.state_dict().items()}
         session.evaluate(2, 3, 100)
@@ -192,8 +192,8 @@ def learned(seed: int, num_steps: int, **settings: Any) -> float:
     try:
         assert isinstance(session.learner, StreamingLearner)
         while session.stream.num_steps < num_steps:
-            session.feed.add(session.stream.step(session.policy))
-            for sample in session.feed.draw():
+            session.experience.add(session.stream.step(session.policy))
+            for sample in session.experience.draw():
                 session.learner.update(sample.transition, sample.weight)
         return session.evaluate(20, 1, 500).mean
     finally:

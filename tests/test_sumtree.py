@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuralq.sumtree import SumTree
+from neuralq.learners.replay.sum_tree import SumTree
 
 weights_lists = st.lists(st.integers(0, 50), min_size=1, max_size=40)
 

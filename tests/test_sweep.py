@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 
-from neuralq.cli import main, sweeps
-from neuralq.cli.sweeps import SweepBar
-from neuralq.record import RunFolderBusy, RunFolderError, read_metrics, read_summary
-from neuralq.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
-from neuralq.sweep import crew as crew_module
+from neuralq.apps.cli import main, sweeps
+from neuralq.apps.cli.sweeps import SweepBar
+from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
+from neuralq.runs.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
+from neuralq.runs.sweep import processes as crew_module
 
 CHILD = """
 import json, os, pathlib, signal, sys, time
@@ -187,13 +187,13 @@ def test_one_process_runs_a_sweep(tmp_path: Path) -> None:
 
 def test_children_stop_when_their_parent_is_killed(tmp_path: Path) -> None:
     child = (
-        "import pathlib, signal, sys, time; from neuralq.sweep import stop_with_parent; stop_with_parent();"
+        "import pathlib, signal, sys, time; from neuralq.runs.sweep import stop_with_parent; stop_with_parent();"
         "place = pathlib.Path(sys.argv[1]);"
         "signal.signal(signal.SIGTERM, lambda *_: (place.with_suffix('.stopped').touch(), sys.exit(0)));"
         "place.with_suffix('.begun').touch(); time.sleep(60)"
     )
     parent = (
-        "import sys; from neuralq.sweep import *\n"
+        "import sys; from neuralq.runs.sweep import *\n"
         f"sweep = create_sweep(sys.argv[1], {CONFIG!r}, range(1))\n"
         f"run_sweep(sweep, lambda sweep, seed: [sys.executable, '-c', {child!r}, sys.argv[2]], 1)\n"
     )

@@ -41,9 +41,9 @@ from neuralq.tabular import (
     q_learning,
     sarsa,
 )
-from neuralq.tabular.acting import Table, choose
-from neuralq.tabular.settings import acting_code
-from neuralq.tabular.streams import new_stream, uniform
+from neuralq.tabular.kernels.acting import Table, choose
+from neuralq.tabular.kernels.random_numbers import new_stream, uniform
+from neuralq.tabular.policies import acting_code
 from neuralq.tabular.theory import robbins_monro_sums, sweep_errors
 from neuralq.types import Transition
 

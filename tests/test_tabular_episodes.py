@@ -28,7 +28,7 @@ from neuralq.tabular import (
     r_learning,
     sarsa,
 )
-from neuralq.tabular.streams import new_stream, uniform
+from neuralq.tabular.kernels.random_numbers import new_stream, uniform
 
 S, A = 5, 3
 

@@ -26,11 +26,11 @@ from neuralq.tabular import (
     queue_dyna,
     sarsa_lambda,
 )
-from neuralq.tabular.acting import FORGET, new_log, new_walk
 from neuralq.tabular.engine import Learner, new_table
+from neuralq.tabular.kernels.acting import FORGET, new_log, new_walk
+from neuralq.tabular.kernels.sweeping import FULL, HEAP_SIZE, _offer, _pop, new_memory
 from neuralq.tabular.planning import DynaLearner, SweepingLearner
-from neuralq.tabular.settings import acting_code, step_code
-from neuralq.tabular.sweeping import FULL, HEAP_SIZE, _offer, _pop, new_memory
+from neuralq.tabular.policies import acting_code, step_code
 
 WALLS = {(1, 2), (2, 2), (3, 2), (4, 5), (0, 7), (1, 7), (2, 7)}
 ROW_3 = {(3, x) for x in range(8)}  # the wall of the blocking maze, open at the right end

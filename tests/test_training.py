@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from neuralq import checkpoint, stopwatch, training
-from neuralq.evaluation import Evaluation
 from neuralq.learners import OnlineSettings, RolloutSettings
-from neuralq.recipes import RunConfig, train
-from neuralq.record import read_metrics, read_summary
-from neuralq.training import seed_for
+from neuralq.runs import RunConfig, train
+from neuralq.runs import clock as stopwatch
+from neuralq.runs import loop as training
+from neuralq.runs.evaluation import Evaluation
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.run_folder import read_metrics, read_summary
+from neuralq.runs.loop import seed_for
 
 
 class Corridor(gym.Env[Any, Any]):
@@ -88,7 +90,7 @@ def test_a_rollout_that_was_begun_is_finished_and_saved_whole(tmp_path: Path) ->
     rollout = RolloutSettings(num_envs=3, num_steps=11, num_minibatches=1)
     config = corridor(learner="rollout", online=None, rollout=rollout, total_steps=100, log_every=1)
     run = train(config, tmp_path / "run")
-    # Lanes restart within the step, so every rollout is 33 steps: the fourth is begun at 99.
+    # Environments restart within the step, so every rollout is 33 steps: the fourth is begun at 99.
     assert run.env_steps == 132
     assert all(step % 33 == 0 for step in steps_of(tmp_path / "run", "evaluation"))
     assert all(int(p.name[5:]) % 33 == 0 for p in (tmp_path / "run" / "checkpoints").iterdir())

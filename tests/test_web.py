@@ -18,17 +18,17 @@ from typing import Any
 
 import pytest
 
+from neuralq.apps.web import lab_app, serve, server
+from neuralq.apps.web.catalogue import field_of
+from neuralq.checks import MissingExtra
 from neuralq.lab.methods import METHODS
 from neuralq.lab.problems import PROBLEMS
-from neuralq.report import MissingExtra
-from neuralq.web import lab_app, serve, server
-from neuralq.web.catalogue import field_of
 
 pytest.importorskip("starlette", reason="the extra web is not installed")
 pytest.importorskip("httpx", reason="starlette's test client needs httpx")
 from starlette.testclient import TestClient
 
-from neuralq.web.pool import Left, Pool, TooLong
+from neuralq.apps.web.pool import Left, Pool, TooLong
 
 STAR = {"problem": "baird", "gamma": 0.99, "step_size": 0.01, "method": "td", "sampling": "expected", "options": {}}
 PLACE = {name: STAR[name] for name in ("problem", "gamma", "step_size")}

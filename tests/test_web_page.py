@@ -24,7 +24,7 @@ SOON = 20_000  # milliseconds; two shared cores
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    start = "from neuralq.web import serve; serve(port=0)"
+    start = "from neuralq.apps.web import serve; serve(port=0)"
     with subprocess.Popen([sys.executable, "-c", start], stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         yield server.stdout.readline().split()[4]

@@ -2,8 +2,8 @@
 
 ``neuralq/MountainCar-v0`` and ``neuralq/Acrobot-v0`` are Gymnasium's own ``MountainCar-v0`` and ``Acrobot-v1`` when one
 is made, and `ClassicVectorEnv` when many are. That one is a `gymnasium.vector.SyncVectorEnv` of Gymnasium's
-environments to the bit, only quicker: lane i draws from a generator of its own, seeded with ``seed + i``, and in the
-same order, so resets agree too; an episode's last observation is the one it arrived at; and at the time limit
+environments to the bit, only quicker: environment i draws from a generator of its own, seeded with ``seed + i``, and in
+the same order, so resets agree too; an episode's last observation is the one it arrived at; and at the time limit
 ``truncated`` is true even where the episode terminates in that very step.
 
 Gymnasium's own ids are left as they are. This package registers its environments wherever it is installed, so a vector
@@ -42,7 +42,7 @@ _NO_LIMIT = int(np.iinfo(np.int64).max)
 
 
 class Dynamics(Protocol):
-    """What `ClassicVectorEnv` steps: where episodes start and how one step changes the arrays of all lanes."""
+    """What `ClassicVectorEnv` steps: where episodes start and how one step changes the arrays of all environments."""
 
     @property
     def num_state(self) -> int:
@@ -62,7 +62,7 @@ class Dynamics(Protocol):
         ...
 
     def step(self, arrays: _Arrays, actions: NDArray[np.int64], limit: int, out: tuple[Any, Any, Any]) -> int:
-        """Steps every lane of ``arrays`` (state, steps, over, observation); answers as the kernels do."""
+        """Steps every environment of ``arrays`` (state, steps, over, observation); answers as the kernels do."""
         ...
 
 
@@ -180,31 +180,32 @@ class ClassicVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[n
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Starts every copy, or only those of ``options["reset_mask"]`` (bool, ``[N]``), in the order of the lanes.
+        """Starts every copy, or only those of ``options["reset_mask"]`` (bool, ``[N]``), in their order.
 
-        Each lane draws its start from its own generator, so what one lane does moves no other's. The other lanes'
+        Each environment draws its start from its own generator, so what one does moves no other's. The others'
         observations stay as they are.
 
         Args:
-            seed: of lane i is ``seed + i``, or ``seed[i]``; None goes on with the lane's generator, which the system's
-                entropy seeds if nothing else has. Lanes that are not reset are not seeded.
+            seed: of environment i is ``seed + i``, or ``seed[i]``; None goes on with the environment's generator, which
+            the system's
+                entropy seeds if nothing else has. Environments that are not reset are not seeded.
             options: ``"reset_mask"``, and ``"low"`` and ``"high"``, between which starts are drawn.
 
         Raises:
             ValueError: a mask of another shape or type, bounds that are no interval, or seeds of another number.
         """
         low, high = self._dynamics.start_bounds(options)
-        lanes = self._lanes_to_reset(options)
+        env_indices = self._envs_to_reset(options)
         seeds = self._seeds(seed)
-        for i in lanes.tolist():
+        for i in env_indices.tolist():
             rng = self._generators[i]
             if rng is None or seeds[i] is not None:
                 rng = self._generators[i] = seeding.np_random(seeds[i])[0]
             self._state[i], self._observation[i] = self._dynamics.start(low, high, rng)
-        self._steps[lanes], self._over[lanes] = 0, False
+        self._steps[env_indices], self._over[env_indices] = 0, False
         return self._observation.copy(), {}
 
-    def _lanes_to_reset(self, options: dict[str, Any] | None) -> NDArray[np.int64]:
+    def _envs_to_reset(self, options: dict[str, Any] | None) -> NDArray[np.int64]:
         if options is None or "reset_mask" not in options:
             return np.arange(self.num_envs)
         mask = np.asarray(options["reset_mask"])

@@ -1,8 +1,9 @@
-"""One step of many Mountain Cars or Acrobots: compiled loops over the lanes, each operation in Gymnasium's order.
+"""One step of many Mountain Cars or Acrobots: compiled loops, each operation in Gymnasium's order.
 
 State, step counts and observations are written in place; the arrays of a step are the caller's. Each step looks at
-every lane before it moves any, so a refused step has changed nothing. It answers with the first lane that cannot be
-stepped, or -1: ``lane`` where its episode is over, ``num_envs + lane`` where its action is not one of 0, 1, 2.
+every environment before it moves any, so a refused step has changed nothing. It answers with the first environment that
+cannot be stepped, or -1: ``environment`` where its episode is over, ``num_envs + environment`` where its action is not
+one of 0, 1, 2.
 
 Mountain Car (Moore 1990; Sutton & Barto 2018, example 10.1): v ← v + 0.001 (a − 1) − 0.0025 cos 3x, x ← x + v, both
 clipped, and the left wall stops the car. Acrobot (Sutton 1996; Sutton & Barto 1998, section 11.3):
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from neuralq.jit import lean_kernel
 
-__all__ = ["acrobot_step", "mountain_car_step", "refused_lane"]
+__all__ = ["acrobot_step", "mountain_car_step", "refused_env"]
 
 _PI = math.pi
 _MAX_VELOCITY_1 = 4 * math.pi
@@ -29,8 +30,8 @@ _MAX_VELOCITY_2 = 9 * math.pi
 
 
 @lean_kernel
-def refused_lane(actions: NDArray[np.int64], over: NDArray[np.bool_]) -> int:
-    """The first lane that is over (its number), else the first with a wrong action (``N +`` its number), else -1.
+def refused_env(actions: NDArray[np.int64], over: NDArray[np.bool_]) -> int:
+    """The first environment that is over (its number), or with a wrong action (``N +`` its number), else -1.
 
     Args:
         actions: ``[N]``.
@@ -85,7 +86,7 @@ def mountain_car_step(
         >>> round(float(state[0, 0]), 6), two.tolist()  # 0.48 + 0.05 - 0.0025 cos(1.44)
         (0.529674, [[True], [False]])
     """
-    refused = refused_lane(actions, over)
+    refused = refused_env(actions, over)
     if refused >= 0:
         return refused
     for i in range(len(over)):
@@ -171,7 +172,7 @@ def acrobot_step(
         >>> bool(np.abs(state).max() < 1e-12), reward.tolist()  # hanging down without torque is an equilibrium
         (True, [-1.0])
     """
-    refused = refused_lane(actions, over)
+    refused = refused_env(actions, over)
     if refused >= 0:
         return refused
     h, half = 0.2, 0.1

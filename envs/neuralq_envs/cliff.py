@@ -6,7 +6,7 @@ The shortest way along the edge takes 13 steps: the optimal return is −13 (γ 
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
 

@@ -7,7 +7,7 @@ cells other than G take 404 steps together.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_fraction, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.canvas import BLUE, CELL, GREEN, GREY, INK, RED, blank, disk, frame, write
 from neuralq_envs.drawn import DrawnEnv
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
 

@@ -13,7 +13,7 @@ cell other than G.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import ACTIONS as _ALL_ACTIONS
 from neuralq_envs.grids import Grid

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from neuralq.checks import check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.graphs import GraphScene
 

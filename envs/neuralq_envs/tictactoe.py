@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.canvas import BLUE, CELL, GREY, INK, PAPER, blank, disk, frame, stroke, write
 from neuralq_envs.drawn import DrawnEnv
 

@@ -7,7 +7,7 @@ steps, with the eight moves of a king 7.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelVectorEnv
+from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
 

@@ -14,19 +14,19 @@ Where those diverge, others converge: `ResidualGradientLearner` descends the Bel
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 """
 
-from neuralq.learners.batch import ReplayLearner
-from neuralq.learners.correction import HeadCorrection, TangentCorrection
-from neuralq.learners.distributional import DistributionalLearner
-from neuralq.learners.dqrc import DQRCLearner, DQRCSettings, TwinHead
-from neuralq.learners.gradient_settings import GradientSettings
-from neuralq.learners.gradient_step import GradientTDSettings
-from neuralq.learners.gradient_td import GradientPredictionLearner, GradientQLearner
-from neuralq.learners.online import OnlineLearner, OnlineSettings, PredictionLearner
-from neuralq.learners.replay_settings import ReplaySettings
-from neuralq.learners.residual_gradient import ResidualGradientLearner, ResidualGradientSettings
+from neuralq.learners.gradient.correction import HeadCorrection, TangentCorrection
+from neuralq.learners.gradient.learner import GradientPredictionLearner, GradientQLearner
+from neuralq.learners.gradient.residual import ResidualGradientLearner, ResidualGradientSettings
+from neuralq.learners.gradient.settings import GradientSettings
+from neuralq.learners.gradient.step import GradientTDSettings
+from neuralq.learners.learner import Descent, Learner, Update
+from neuralq.learners.replay.distributional import DistributionalLearner
+from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead
+from neuralq.learners.replay.learner import ReplayLearner
+from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
-from neuralq.learners.streaming import StreamingLearner, StreamingSettings
-from neuralq.learners.update import Descent, Learner, Update
+from neuralq.learners.traces.learner import OnlineLearner, OnlineSettings, PredictionLearner
+from neuralq.learners.traces.streaming import StreamingLearner, StreamingSettings
 
 __all__ = [
     "DQRCLearner",

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
-from neuralq.learners.average import IterateAverage
-from neuralq.learners.update import Descent, Update
-from neuralq.optim import Optimiser
+from neuralq.learners.averaging import IterateAverage
+from neuralq.learners.learner import Descent, Update
+from neuralq.learners.optim import Optimiser
 from neuralq.q.engine import Engine
 from neuralq.types import Transition
 
@@ -46,7 +46,7 @@ class RolloutSettings:
         anneal_env_steps: environment steps over which it falls in place of the run's; only with ``anneal``.
         anneal_to: share of the learning rate that is left then, in [0, 1]; only with ``anneal``.
         normalise_observations: whether observations are centred and divided by their standard deviation so far
-            (`neuralq.interact.Normalisation`), as quantities of very different size need.
+            (`neuralq.runs.stream.Normalisation`), as quantities of very different size need.
         refresh_targets: whether the λ-returns are computed anew, with the values of the moment, before every pass; else
             once per rollout, as published.
         average_updates: rollouts over which the parameters are averaged that greedy evaluations and the saved agent use
@@ -205,7 +205,7 @@ class RolloutLearner:
                 self._average.follow()
         return torch.from_numpy(errors), torch.from_numpy(picked)
 
-    def played(self) -> Tensor:
+    def evaluation_parameters(self) -> Tensor:
         """The parameters for greedy play: the average where one is kept, else those that are learned."""
         return self.engine.flat.values if self._average is None else self._average.values
 

@@ -9,10 +9,10 @@ from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
 from neuralq.q.custom import Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
-from neuralq.q.exact_case import LinearQ, TableQ
 from neuralq.q.flat import FlatParameters
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
+from neuralq.q.table_and_linear import LinearQ, TableQ
 
 __all__ = [
     "MLP",

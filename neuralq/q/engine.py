@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_positive
-from neuralq.q import mlp_kernels as kernels
 from neuralq.q.bodies import ACTIVATIONS, Trunk
 from neuralq.q.flat import FlatParameters
+from neuralq.q.kernels import batch as kernels
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
 from neuralq.types import QFunction
@@ -281,11 +281,11 @@ class MlpEngine:
         )  # fmt: skip
         return out
 
-    def _pull(self, x: _Array, actions: _Array, target: Any, weight: Any, loss: int) -> Any:
+    def _loss_gradient(self, x: _Array, actions: _Array, target: Any, weight: Any, loss: int) -> Any:
         if actions.size != len(x):
             raise ValueError(f"got {len(x)} states and {actions.size} actions; they must pair up")
         q = np.empty(len(x), self._kind)
-        wrong = kernels.pull(
+        wrong = kernels.loss_gradient(
             self._values, self._grad, self._plan, self._starts, self._layout, self._num_actions, self._activation,
             x, actions, q if target is None else target, self._ones[: len(x)] if weight is None else weight,
             loss, self._delta, self._acts, self._hats, self._inverse, self._deltas, self._pairs, self._spare, q,
@@ -300,20 +300,22 @@ class MlpEngine:
         self._check_legal(s, a, weight)
         wanted = target.to(self._dtype).reshape(-1).numpy()
         weights = None if weight is None else weight.to(self._dtype).reshape(-1).numpy()
-        q = self._pull(self._rows(s)[0], a.reshape(-1).numpy(), wanted, weights, self._loss)
+        q = self._loss_gradient(self._rows(s)[0], a.reshape(-1).numpy(), wanted, weights, self._loss)
         return torch.from_numpy(wanted - q).view(a.shape)
 
     def loss_gradient_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None = None) -> _Array:
         """As `loss_gradient` for ``[B]`` samples in arrays, target and weight in the network's precision."""
         if not len(a) == len(target) == (len(a) if weight is None else len(weight)):
             raise ValueError(f"actions, targets and weights must pair up; got {len(a)} and {len(target)} of them")
-        return cast(_Array, target - self._pull(self._array_rows(s), a, target, weight, self._loss))
+        return cast(_Array, target - self._loss_gradient(self._array_rows(s), a, target, weight, self._loss))
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
         _check_single(a)
         self._check_legal(s, a)
-        return torch.from_numpy(self._pull(self._rows(s)[0], a.reshape(-1).numpy(), None, None, kernels.VALUE))[0]
+        return torch.from_numpy(
+            self._loss_gradient(self._rows(s)[0], a.reshape(-1).numpy(), None, None, kernels.VALUE)
+        )[0]
 
     def _check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
         if self._mask is not None:

@@ -5,11 +5,11 @@ from neuralq.tabular.control import apply, double_q, expected_sarsa, q_learning,
 from neuralq.tabular.engine import RunOptions
 from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
 from neuralq.tabular.model import Model, compile_model
-from neuralq.tabular.nstep import apply_n_step, n_step
+from neuralq.tabular.n_step import apply_n_step, n_step
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
+from neuralq.tabular.policies import EpsilonGreedy, KToTheQ, Power, RandomPolicy, Softmax, UpperConfidence, Visits
 from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
 from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
-from neuralq.tabular.settings import EpsilonGreedy, KToTheQ, Power, RandomPolicy, Softmax, UpperConfidence, Visits
 from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
 from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 

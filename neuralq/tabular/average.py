@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_fraction
 from neuralq.jit import lean_kernel
-from neuralq.tabular.acting import Log, Table, Walk, best_value, next_step, step_length
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table
+from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, next_step, step_length
+from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.model import Model, ModelArrays
+from neuralq.tabular.policies import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Learned
-from neuralq.tabular.settings import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
-from neuralq.tabular.streams import Seed
 
 __all__ = ["r_learning", "run_r_learning"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice
-from neuralq.tabular.acting import Table
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import Table
+from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.onestep import RULES, OneStep
+from neuralq.tabular.policies import UPPER_CONFIDENCE, PolicyLike, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
-from neuralq.tabular.settings import UPPER_CONFIDENCE, PolicyLike, StepSizeLike, acting_code, step_code
-from neuralq.tabular.streams import Seed
 
 __all__ = ["apply", "double_q", "expected_sarsa", "q_learning", "sarsa"]
 

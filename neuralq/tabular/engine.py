@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_discount, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.tabular.acting import (
+from neuralq.tabular.kernels.acting import (
     ACTION,
     EPISODE_STEPS,
     EPISODES,
@@ -33,10 +33,10 @@ from neuralq.tabular.acting import (
     new_log,
     new_walk,
 )
+from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.model import RESTARTS, Model, ModelArrays, compile_model, empty_arrays
+from neuralq.tabular.policies import ActingCode
 from neuralq.tabular.results import Curve, Experience, Learned, masked
-from neuralq.tabular.settings import ActingCode
-from neuralq.tabular.streams import Seed
 
 __all__ = ["Learner", "RunOptions", "learn", "new_table", "replay", "table_from"]
 

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.jit import lean_kernel
-from neuralq.tabular.acting import Log, Table, Walk, best_value, next_step, step_length
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, next_step, step_length
+from neuralq.tabular.kernels.random_numbers import Seed, uniform
 from neuralq.tabular.model import ModelArrays
+from neuralq.tabular.policies import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
-from neuralq.tabular.settings import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
-from neuralq.tabular.streams import Seed, uniform
 
 __all__ = ["Store", "apply_episodes", "episodic_q_learning", "run_episodes"]
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from neuralq.checks import check_choice
 from neuralq.jit import lean_kernel
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import Outcomes
+from neuralq.mdp.outcomes import Outcomes
 
 __all__ = ["Model", "ModelArrays", "compile_model", "complete_outcomes", "empty_arrays"]
 

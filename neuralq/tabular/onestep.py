@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import lean_kernel
-from neuralq.tabular.acting import FORGET, Log, Table, Walk, best_value, expected_value, next_step, step_length
-from neuralq.tabular.fast import run_q_learning
+from neuralq.tabular.kernels.acting import FORGET, Log, Table, Walk, best_value, expected_value, next_step, step_length
+from neuralq.tabular.kernels.q_learning import run_q_learning
+from neuralq.tabular.kernels.random_numbers import uniform
 from neuralq.tabular.model import ModelArrays
-from neuralq.tabular.settings import EPSILON_GREEDY, RANDOM, ActingCode, StepCode
-from neuralq.tabular.streams import uniform
+from neuralq.tabular.policies import EPSILON_GREEDY, RANDOM, ActingCode, StepCode
 
 __all__ = ["OneStep", "run_one_step"]
 

@@ -6,21 +6,21 @@ import math
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.tabular.acting import Log, Table, Walk
-from neuralq.tabular.dyna import BACKUPS as DYNA_BACKUPS
-from neuralq.tabular.dyna import new_recall, run_dyna
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table
+from neuralq.tabular.kernels.acting import Log, Table, Walk
+from neuralq.tabular.kernels.dyna import BACKUPS as DYNA_BACKUPS
+from neuralq.tabular.kernels.dyna import new_recall, run_dyna
+from neuralq.tabular.kernels.random_numbers import Seed
+from neuralq.tabular.kernels.sweeping import BACKUPS, FULL, OVERFLOW, SAMPLE, new_memory, run_sweeping
 from neuralq.tabular.model import Model, ModelArrays
+from neuralq.tabular.policies import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Learned
-from neuralq.tabular.settings import ActingCode, PolicyLike, StepCode, StepSizeLike, acting_code, step_code
-from neuralq.tabular.streams import Seed
-from neuralq.tabular.sweeping import BACKUPS, FULL, OVERFLOW, SAMPLE, new_memory, run_sweeping
 
 __all__ = ["DynaLearner", "SweepingLearner", "dyna_q", "prioritized_sweeping", "queue_dyna"]
 
 
 class DynaLearner:
-    """The learner that `neuralq.tabular.dyna.run_dyna` runs.
+    """The learner that `neuralq.tabular.kernels.dyna.run_dyna` runs.
 
     Args:
         table: values and visits, changed in place.
@@ -57,7 +57,7 @@ class DynaLearner:
 
 
 class SweepingLearner:
-    """The learner that `neuralq.tabular.sweeping.run_sweeping` runs.
+    """The learner that `neuralq.tabular.kernels.sweeping.run_sweeping` runs.
 
     Args:
         table: values and visits, changed in place.

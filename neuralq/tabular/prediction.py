@@ -20,12 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.jit import lean_kernel
 from neuralq.mdp import FiniteMDP, Outcomes
-from neuralq.tabular.acting import REPLAY, Log, Table, Walk, new_walk, next_step, step_length
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import REPLAY, Log, Table, Walk, new_walk, next_step, step_length
+from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.model import ModelArrays, complete_outcomes, empty_arrays
+from neuralq.tabular.policies import CONSTANT, ActingCode, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
-from neuralq.tabular.settings import CONSTANT, ActingCode, StepCode, StepSizeLike, acting_code, step_code
-from neuralq.tabular.streams import Seed
 from neuralq.tabular.traces import Traces, new_traces
 
 __all__ = ["batch_td", "predict", "run_td", "td_lambda", "under_policy"]

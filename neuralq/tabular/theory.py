@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_whole
-from neuralq.tabular.acting import step_length
 from neuralq.tabular.control import apply
+from neuralq.tabular.kernels.acting import step_length
+from neuralq.tabular.policies import StepSizeLike, step_code
 from neuralq.tabular.results import Experience
-from neuralq.tabular.settings import StepSizeLike, step_code
 
 __all__ = ["Sweeps", "robbins_monro_sums", "sweep_errors"]
 

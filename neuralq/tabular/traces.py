@@ -27,11 +27,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_fraction
 from neuralq.jit import lean_kernel
-from neuralq.tabular.acting import Log, Table, Walk, best_value, expected_value, next_step, step_length
 from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, expected_value, next_step, step_length
+from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.model import ModelArrays
-from neuralq.tabular.results import Experience, Learned
-from neuralq.tabular.settings import (
+from neuralq.tabular.policies import (
     UPPER_CONFIDENCE,
     ActingCode,
     PolicyLike,
@@ -40,7 +40,7 @@ from neuralq.tabular.settings import (
     acting_code,
     step_code,
 )
-from neuralq.tabular.streams import Seed
+from neuralq.tabular.results import Experience, Learned
 
 __all__ = ["Traces", "apply_lambda", "new_traces", "q_lambda", "run_traces", "sarsa_lambda"]
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from neuralq.checks import check_fraction, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.simulate import ModelEnv, ModelVectorEnv
+from neuralq.mdp.environment import ModelEnv, ModelVectorEnv
 from neuralq_envs.counterexamples.problem import Problem
 
 __all__ = [

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from neuralq.lab.linear.process import Process
 from neuralq.lab.methods.method import Floats
-from neuralq.lab.process import Process
 
 __all__ = ["chain_of", "epsilon_greedy", "greedy_policy", "greedy_values", "pairs_of", "solve_chain", "visits_of"]
 
@@ -61,7 +61,7 @@ def pairs_of(process: Process, method: str) -> Index:
         ValueError: the rows are states, so that there are no actions to compare.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> pairs_of(linear_process(star()), "q-learning")
         Traceback (most recent call last):
@@ -88,7 +88,7 @@ def greedy_policy(process: Process, row_of: Index, w: Floats, epsilon: float = 0
     Source: Sutton & Barto 2018, section 2.2.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])
@@ -117,7 +117,7 @@ def chain_of(process: Process, row_of: Index, policy: Floats) -> Chain:
     """The chain over pairs under any policy, ``[n, n]``, dense where the process is.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])
@@ -136,7 +136,7 @@ def visits_of(process: Process, row_of: Index, policy: Floats) -> Floats:
         ValueError: the policy ends up in one of several separate parts of the model, so that it depends on chance.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.checks import check_fraction
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import chain_of, epsilon_greedy, greedy_values, pairs_of, visits_of
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
-from neuralq.lab.process import Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["Q_LEARNING", "SARSA", "piece_of_policy"]
 
@@ -47,7 +47,7 @@ def piece_of_policy(process: Process, policy: Floats, on_policy: bool = False) -
     Source: Gordon 2000; Tsitsiklis & Van Roy 1997.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.from_arrays([[[0.0]], [[0.0]]], [[1.0, -1.0]], substochastic=True)

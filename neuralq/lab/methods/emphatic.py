@@ -20,11 +20,11 @@ from scipy import sparse
 from scipy.sparse.linalg import eigs
 
 from neuralq.checks import check_fraction
+from neuralq.lab.linear.process import LARGEST_DENSE, Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import solve_chain
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
 from neuralq.lab.methods.td import errors
-from neuralq.lab.process import LARGEST_DENSE, Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["ETD", "emphasis", "expected_emphatic_run", "follow_on", "follow_on_second_moment"]
 
@@ -46,7 +46,7 @@ def follow_on(process: Process, beta: float | None = None, num_steps: int | None
     Source: Sutton, Mahmood & White 2016, section 5; with β Hallak, Tamar, Munos & Mannor 2016.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> follow_on(linear_process(star())).round(6).tolist()[-2:]
         [0.142857, 99.142857]
@@ -75,7 +75,7 @@ def emphasis(process: Process, lambda_: float = 0.0, beta: float | None = None) 
     Source: Sutton, Mahmood & White 2016, equations 17 to 20.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> emphasis(linear_process(star()), lambda_=1.0).round(6).tolist()[-1]  # λ = 1 weighs nothing
         0.142857
@@ -100,7 +100,7 @@ def follow_on_second_moment(process: Process, beta: float | None = None) -> floa
     Source: Hallak, Tamar, Munos & Mannor 2016; Sutton & Barto 2018, section 11.9.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> round(follow_on_second_moment(linear_process(star())), 4)  # 7 γ²
         6.8607
@@ -133,7 +133,7 @@ def expected_emphatic_run(process: Process, w0: Floats, step_size: float, num_sw
     Source: Sutton & Barto 2018, section 11.8 and figure 11.6.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> run = expected_emphatic_run(linear_process(star()), star().initial_weights, 0.03, 200)
         >>> run.shape, bool(np.abs(star().features @ run[-1]).max() < 0.1)

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from neuralq.lab.linear.process import Index, Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import greedy_values
 from neuralq.lab.methods.gradient import corrected_flow, dot, has_trace, step_ratio, with_helpers
 from neuralq.lab.methods.method import Expected, Floats, Method, Options
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.methods.trace import Trace
-from neuralq.lab.process import Index, Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["GQ", "GREEDY_GQ", "greedy_rows"]
 
@@ -98,7 +98,7 @@ def greedy_rows(process: Process, w: Floats) -> Index:
         ValueError: the rows are states.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])

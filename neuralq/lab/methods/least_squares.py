@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.checks import check_whole
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross, td
 from neuralq.lab.methods.trace import Trace
-from neuralq.lab.process import Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["BRM", "FITTED", "FITTED_Q", "LSPI", "LSTD", "PolicyIteration", "lspi"]
 
@@ -62,7 +62,7 @@ def lspi(process: Process, w0: Floats, num_iterations: int = 100) -> PolicyItera
     Source: Lagoudakis & Parr 2003.
 
     Example:
-        >>> from neuralq.lab.process import linear_process
+        >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq.mdp import FiniteMDP
         >>> from neuralq_envs.counterexamples import Problem
         >>> mdp = FiniteMDP.garnet(5, 2, 2, seed=0)

@@ -18,8 +18,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.lab.process import Process
-from neuralq.lab.sampling import Sample
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import Sample
 
 __all__ = ["Expected", "Learner", "Method", "Options", "Piece", "flow"]
 

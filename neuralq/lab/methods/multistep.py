@@ -28,11 +28,11 @@ import numpy as np
 from scipy import sparse
 
 from neuralq.checks import check_fraction, check_positive, check_whole
+from neuralq.lab.linear.process import LARGEST_DENSE, Arcs, Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import pairs_of, solve_chain
 from neuralq.lab.methods.method import Expected, Floats, Learner, Method, Options, flow
 from neuralq.lab.methods.td import errors
-from neuralq.lab.process import LARGEST_DENSE, Arcs, Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["EXPECTED_SARSA", "NAIVE_Q", "NSTEP", "RETRACE", "TREE_BACKUP", "VTRACE"]
 

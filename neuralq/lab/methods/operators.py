@@ -7,8 +7,8 @@ C = Xᵀ D X,    H = γ Xᵀ D P X,    A = C − H
 from __future__ import annotations
 
 from neuralq.exact import td_operator
+from neuralq.lab.linear.process import Process
 from neuralq.lab.methods.method import Floats
-from neuralq.lab.process import Process
 
 __all__ = ["covariance", "cross", "naive_residual", "td"]
 

@@ -22,10 +22,10 @@ from __future__ import annotations
 import numpy as np
 
 from neuralq.checks import check_positive, check_whole
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross
-from neuralq.lab.process import Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["HARD_TARGET", "POLYAK_TARGET", "PROJECTED_TARGET", "frozen_target_map"]
 

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
 from neuralq.lab.methods.operators import naive_residual, td
 from neuralq.lab.methods.trace import Trace
-from neuralq.lab.process import Process
-from neuralq.lab.sampling import Sample
 
 __all__ = ["NAIVE_RESIDUAL", "RESIDUAL", "TD"]
 

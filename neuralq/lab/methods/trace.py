@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from neuralq.checks import check_fraction
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.method import Floats
-from neuralq.lab.sampling import Sample
 
 __all__ = ["Trace"]
 

@@ -1,0 +1,1 @@
+"""What a person starts: the command line, the pages served on this machine, and the chapter."""

@@ -1,0 +1,113 @@
+"""``neuralq compare``: runs and sweeps side by side, as a table and as a plot."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.sweeps import is_td_gammon_run
+from neuralq.runs.report.comparison import Group, comparison_png, comparison_svg, read_groups
+from neuralq.runs.report.page import format_value
+
+__all__ = ["compare"]
+
+_FORMATS = {".svg", ".png"}
+_HEADINGS = ("run", "seeds", "greedy return", "95 % interval", "mean", "steps", "CPU s")
+
+
+def compare(argv: list[str]) -> int:
+    """Compare the final greedy returns of runs, grouped over their seeds."""
+    parser = command_parser(
+        "compare",
+        "Compare runs and sweeps. Runs that differ in their seed alone are one row: the interquartile mean of their "
+        "last greedy returns and its 95 % interval (stratified bootstrap, Agarwal et al. 2021).",
+        "neuralq compare runs/* --out curves.svg",
+        "neuralq compare SWEEP-A SWEEP-B --json",
+    )
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders and sweep folders")
+    parser.add_argument("--out", metavar="FILE", help="also draw the learning curves into this .svg or .png file")
+    options = parser.parse_args(argv)
+    out = None if options.out is None else Path(options.out)
+    if out is not None and out.suffix.lower() not in _FORMATS:
+        raise Failure(f"--out must end in .svg or .png, got {options.out!r}", 2)
+    for path in filter(is_td_gammon_run, options.runs):
+        raise Failure(f"{path} is a TD-Gammon run, which has no returns; neuralq evaluate {path} --against RUN", 2)
+    groups, left_out = read_groups(options.runs)
+    for reason in left_out:
+        print(f"neuralq: left out: {reason}", file=sys.stderr)
+    if out is not None:
+        _draw(groups, out)
+    if not options.json:
+        _print(groups)
+    plain = {"groups": [group.plain() for group in groups], "left_out": left_out, "out": options.out}
+    print_result(plain, options.json, [] if out is None else [f"learning curves: {out}"])
+    return 0
+
+
+def _draw(groups: Sequence[Group], out: Path) -> None:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix.lower() == ".png":
+        out.write_bytes(comparison_png(groups))
+    else:
+        out.write_text(comparison_svg(groups) + "\n", encoding="utf-8")
+
+
+def _print(groups: Sequence[Group]) -> None:
+    # A pipe has no width of its own: wide enough for the table, so that nothing is cut.
+    width = max(shutil.get_terminal_size((160, 24)).columns, 80)
+    console = Console(highlight=False, width=width)
+    names = list(dict.fromkeys(name for group in groups for name in group.settings))
+    rows = [_numbers(group) for group in groups]
+    settings = [[format_value(group.settings.get(name)) for name in names] for group in groups]
+    beside = _width([[*_HEADINGS, *names], *map(list.__add__, rows, settings)]) <= width
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in _HEADINGS:
+        table.add_column(
+            heading, **({"overflow": "fold"} if heading == "run" else {"justify": "right", "no_wrap": True})
+        )
+    for name in names if beside else ():
+        table.add_column(escape(name.rstrip("_")), overflow="fold")
+    for row, own in zip(rows, settings, strict=True):
+        table.add_row(*map(escape, [*row, *(own if beside else ())]))
+    console.print(table)
+    if not beside:  # runs of different learners differ in dozens of settings
+        for group in groups:
+            console.print(escape(f"{group.name}: {_in_words(group)}"), soft_wrap=True)
+
+
+def _numbers(group: Group) -> list[str]:
+    """The cells below `_HEADINGS`."""
+    found = group.estimate
+    return [
+        group.name,
+        str(len(group.runs)),
+        f"{found.iqm:.1f}",
+        "–" if found.low is None or found.high is None else f"{found.low:.1f} … {found.high:.1f}",
+        f"{sum(group.returns) / len(group.runs):.1f}",
+        _spread([run.env_steps for run in group.runs]),
+        _spread([run.cpu_seconds for run in group.runs]),
+    ]
+
+
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Characters that a table with these rows takes."""
+    return sum(max(map(len, column)) + 2 for column in zip(*rows, strict=True))
+
+
+def _in_words(group: Group) -> str:
+    own = {name: value for name, value in group.settings.items() if value is not None}
+    return ", ".join(f"{name.rstrip('_')} {format_value(value)}" for name, value in own.items())
+
+
+def _spread(values: Sequence[float]) -> str:
+    """One number, or the smallest and the largest."""
+    low, high = min(values), max(values)
+    shown = [f"{value:,}" if isinstance(value, int) else f"{value:.1f}" for value in (low, high)]
+    return shown[0] if shown[0] == shown[1] else "–".join(shown)

@@ -1,0 +1,208 @@
+"""``neuralq solve``: the exact answer of an environment that has a model."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.pages.grids import short
+from neuralq.apps.pages.page import Arrow, Cell, Exhibit, Grid
+from neuralq.apps.pages.svg import exhibit_svg
+from neuralq.apps.pages.text import ARROWS, drawing_lines
+from neuralq.exact import METHODS, Solution, count_optimal_policies
+from neuralq.exact import solve as solve_mdp
+from neuralq.mdp import FiniteMDP
+
+__all__ = ["solve"]
+
+_MOST_ROWS = 64
+_MOST_COLUMNS = 16
+_COMPASS = ("north", "east", "south", "west")
+# Moves of Gymnasium's own grids, in the order of their action numbers: left, down, right, up, and clockwise from up.
+_FROZEN_LAKE, _CLIFF_WALKING = (3, 2, 1, 0), (0, 1, 2, 3)
+
+
+def solve(argv: list[str]) -> int:
+    """Solve the model of an environment and print values, policy and the guaranteed bound."""
+    options = _parser().parse_args(argv)
+    mdp, layout = _model(options.env, options.env_kwargs)
+    solution = solve_mdp(mdp, options.gamma, options.method, options.tol, max_iterations=options.max_iterations)
+    grid = None if layout is None else layout.drawn(mdp, solution)
+    if options.svg is not None:
+        if grid is None:
+            raise Failure(f"{options.env} names no rows and columns, so there is no grid to draw; leave out --svg")
+        page = Exhibit("solve", f"{options.env}, γ = {options.gamma:g}", "", (), (), (grid,))
+        Path(options.svg).write_text(exhibit_svg(page), encoding="utf-8")
+    actions = [np.flatnonzero(row).tolist() for row in solution.optimal_actions]
+    plain = {
+        "env": options.env,
+        "gamma": options.gamma,
+        "method": solution.method,
+        "num_states": mdp.num_states,
+        "v": solution.v.tolist(),
+        "policy": solution.policy.tolist(),
+        "optimal_actions": actions,
+        "iterations": solution.iterations,
+        "backups": solution.backups,
+        "residual": _finite(solution.residual),
+        "bound": _finite(solution.bound),
+        "converged": solution.converged,
+        "seconds": solution.seconds,
+    }
+    lines = _table(mdp, solution) if grid is None else [*drawing_lines(grid), _legend(layout)]
+    print_result(plain, options.json, [*lines, *_summary(solution)])
+    if not solution.converged:
+        raise Failure(f"did not converge: the error may be as large as {solution.bound:.3g}; allow a larger --tol")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "solve",
+        "Compute V* and every optimal action of an environment with a transition table.",
+        "neuralq solve FrozenLake-v1",
+        "neuralq solve neuralq/MitchellGrid-v0 --gamma 0.9",
+    )
+    parser.usage = "neuralq solve [options] ENV"
+    parser.add_argument(
+        "env", metavar="ENV", help="Gymnasium id of an environment with a transition table P, or one of neuralq's"
+    )
+    parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99)")
+    parser.add_argument("--method", default="auto", choices=METHODS, help="how to solve it (default: auto)")
+    parser.add_argument("--tol", type=float, default=1e-8, help="guaranteed largest error of V (default: 1e-8)")
+    parser.add_argument(
+        "--max-iterations", type=int, metavar="N", help="stop after so many (default: when it is solved)"
+    )
+    parser.add_argument(
+        "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
+    )
+    parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
+    return parser
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows no infinity: a bound that is not known is null."""
+    return value if np.isfinite(value) else None
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"must be a JSON object such as '{{\"is_slippery\": false}}', got {text!r}")
+    return value
+
+
+def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | None]:
+    try:
+        env = gym.make(env_id, **kwargs)
+    except Exception as error:  # the environment's own code ran
+        raise ValueError(f"cannot make the environment {env_id!r}: {type(error).__name__}: {error}") from error
+    try:
+        mdp = FiniteMDP.from_gymnasium(env)
+        return mdp, _layout(env.unwrapped, mdp)
+    finally:
+        env.close()
+
+
+class _Layout:
+    """Where the states of a grid lie.
+
+    Args:
+        num_columns: width.
+        directions: where each action goes: 0 north, 1 east, 2 south, 3 west; None for a move that has no arrow here.
+        signs: what stands in each cell, or a blank.
+    """
+
+    def __init__(self, num_columns: int, directions: tuple[int | None, ...], signs: str) -> None:
+        self.num_columns = num_columns
+        self.directions = directions
+        self.signs = signs
+
+    def drawn(self, mdp: FiniteMDP, solution: Solution) -> Grid:
+        """V* with an arrow for every optimal move; walls are cells that nothing leads to and nothing leaves."""
+        entered = _entered(mdp)
+        cells = []
+        for s in range(mdp.num_states):
+            if self.signs[s] != " ":
+                cells.append(Cell(self.signs[s]))
+            elif mdp.is_terminal[s]:
+                cells.append(Cell("end") if entered[s] else Cell(wall=True))
+            else:
+                best = (self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
+                arrows = tuple(Arrow(d) for d in sorted(d for d in best if d is not None))
+                cells.append(Cell(short(float(solution.v[s])), arrows))
+        return Grid("V* and every optimal move", self.num_columns, tuple(cells))
+
+
+def _layout(env: Any, mdp: FiniteMDP) -> _Layout | None:
+    """From the names of the states, or from what Gymnasium's own grids say about themselves."""
+    desc, shape = getattr(env, "desc", None), getattr(env, "shape", None)
+    if mdp.state_names is not None:
+        return _named_layout(mdp)
+    if isinstance(desc, np.ndarray) and desc.size == mdp.num_states and mdp.num_actions == 4:
+        signs = "".join(desc.astype(str).reshape(-1).tolist())
+        return _Layout(desc.shape[1], _FROZEN_LAKE, re.sub("[^GH]", " ", signs))
+    if isinstance(shape, tuple) and len(shape) == 2 and np.prod(shape) == mdp.num_states and mdp.num_actions == 4:
+        return _Layout(int(shape[1]), _CLIFF_WALKING, " " * mdp.num_states)
+    return None
+
+
+def _named_layout(mdp: FiniteMDP) -> _Layout | None:
+    """States called "row i, column j", row by row."""
+    found = [re.fullmatch(r"row (\d+), column (\d+)", name) for name in mdp.state_names or ()]
+    places = [(int(match[1]), int(match[2])) for match in found if match is not None]
+    num_columns = 1 + max((column for _, column in places), default=-1)
+    in_order = [(s // num_columns, s % num_columns) for s in range(mdp.num_states)] if num_columns else []
+    names = mdp.action_names or ()
+    if not in_order or places != in_order or num_columns > _MOST_COLUMNS or not set(_COMPASS) <= set(names):
+        return None
+    directions = tuple(_COMPASS.index(name) if name in _COMPASS else None for name in names)
+    return None if None in directions else _Layout(num_columns, directions, " " * mdp.num_states)
+
+
+def _entered(mdp: FiniteMDP) -> NDArray[np.bool_]:
+    """States that some move leads to."""
+    entered = np.zeros(mdp.num_states, dtype=bool)
+    entered[mdp.transition.indices if mdp.outcomes is None else mdp.outcomes.s_t] = True
+    return entered
+
+
+def _legend(layout: _Layout | None) -> str:
+    assert layout is not None
+    moves = (f"{ARROWS[d]} is action {a}" for a, d in enumerate(layout.directions) if d is not None)
+    return ", ".join(moves)
+
+
+def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
+    names = mdp.state_names or [""] * mdp.num_states
+    lines = ["state        V*  optimal actions"]
+    for s in range(min(len(solution.v), _MOST_ROWS)):
+        chosen = np.flatnonzero(solution.optimal_actions[s])
+        actions = (
+            " ".join(str(a) if mdp.action_names is None else mdp.action_names[int(a)] for a in chosen) or "terminal"
+        )
+        lines.append(f"{s:5d}  {solution.v[s]:8.4f}  {actions}{f'  ({names[s]})' if names[s] else ''}")
+    if len(solution.v) > _MOST_ROWS:
+        lines.append(f"… and {len(solution.v) - _MOST_ROWS} more states (--json has them all)")
+    return lines
+
+
+def _summary(solution: Solution) -> list[str]:
+    count = count_optimal_policies(solution)
+    policies = f"{count:,}" if count < 1e9 else f"about 10^{len(str(count)) - 1}"
+    return [
+        f"deterministic optimal policies: {policies}",
+        f"{solution.method}: {solution.iterations} iterations, {solution.seconds:.3f} s, "
+        f"guaranteed largest error {solution.bound:.2g}",
+    ]

@@ -1,0 +1,182 @@
+"""``neuralq watch`` and ``neuralq record``: see a trained run play."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.film import Moment, caption, frame_rate, make_shown, picture, play, writers_for
+from neuralq.apps.cli.sweeps import single_run
+from neuralq.runs import RunConfig, load
+from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.games import make_single
+
+__all__ = ["record", "watch"]
+
+
+def watch(argv: list[str]) -> int:
+    """Show greedy episodes in a window, or as text where there is no window to be had."""
+    parser = command_parser(
+        "watch",
+        "Watch a trained run play in a window, or as text where the environment draws text and there is no display.",
+        "neuralq watch RUN",
+        "neuralq watch RUN --best --episodes 10",
+    )
+    _add_options(parser, num_episodes=3)
+    options = parser.parse_args(argv)
+    path = single_run(options.run)
+    config = config_from_dict(read_config(path))
+    agent = load(path, options.best)  # imports the module that registers the environment, too
+    mode = _shown_mode(config, path)
+    env = make_shown(config, mode)
+    returns, pause = [], 1.0 / frame_rate(env)
+    print(f"neuralq: {options.episodes} episodes; Ctrl-C ends", file=sys.stderr)
+    try:
+        for moment in play(env, agent, options.episodes, options.seed, _limit(options, config)):
+            if mode == "ansi":
+                print(f"{env.render()}\n{caption(moment)}\n", file=sys.stderr)
+                time.sleep(pause)
+            if moment.over:
+                returns.append(moment.episode_return)
+                if not options.json:
+                    print(f"episode {moment.episode}: return {moment.episode_return:g} in {moment.step} steps")
+    finally:
+        env.close()
+    print_result({"returns": returns, "run_dir": str(path), "mode": mode}, options.json, [])
+    return 0
+
+
+def record(argv: list[str]) -> int:
+    """Film greedy episodes."""
+    parser = command_parser(
+        "record",
+        "Film a trained run; needs no display. Step, return and the largest action value stand below the picture.",
+        "neuralq record RUN --gif run.gif",
+        "neuralq record RUN --mp4 run.mp4 --episodes 3 --best",
+    )
+    _add_options(parser, num_episodes=1)
+    parser.add_argument("--gif", metavar="FILE", help="write a GIF")
+    parser.add_argument("--mp4", metavar="FILE", help="write an MP4")
+    parser.add_argument("--fps", type=float, metavar="X", help="steps per second (default: what the environment says)")
+    parser.add_argument("--width", type=int, default=480, metavar="N", help="of the picture in pixels (default: 480)")
+    options = parser.parse_args(argv)
+    if (options.fps is not None and not 0 < options.fps <= 1000) or not 16 <= options.width <= 4096:
+        raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
+    path = single_run(options.run)
+    config = config_from_dict(read_config(path))
+    agent = load(path, options.best)
+    _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
+    env = make_shown(config, "rgb_array")
+    try:
+        rate = options.fps or frame_rate(env)
+        returns = _film(env, play(env, agent, options.episodes, options.seed, _limit(options, config)), rate, options)
+    finally:
+        env.close()
+    files = [Path(name) for name in (options.gif, options.mp4) if name is not None]
+    plain = {
+        "returns": returns,
+        "run_dir": str(path),
+        "files": {str(file): file.stat().st_size for file in files},
+        "frames_per_second": rate,
+    }
+    lines = [f"{file}: {file.stat().st_size / 1e6:.2f} MB" for file in files]
+    print_result(plain, options.json, [f"returns {', '.join(f'{value:g}' for value in returns)}", *lines])
+    return 0
+
+
+def _add_options(parser: argparse.ArgumentParser, num_episodes: int) -> None:
+    add = parser.add_argument
+    add("run", help="run folder")
+    add("--episodes", type=int, default=num_episodes, metavar="N", help=f"how many (default: {num_episodes})")
+    add("--seed", type=int, default=0, metavar="N", help="of the episodes (default: 0)")
+    add("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add("--max-steps", type=int, metavar="N", help="cut an episode after so many (default: as in evaluations)")
+
+
+def _limit(options: argparse.Namespace, config: RunConfig) -> int:
+    for name, low in (("episodes", 1), ("seed", 0), ("max_steps", 1)):
+        value = getattr(options, name)
+        if value is not None and value < low:
+            raise Failure(f"--{name.replace('_', '-')} must be a whole number of at least {low}, got {value}", 2)
+    limit: int = options.max_steps or config.evaluation_max_steps
+    return limit
+
+
+def _modes(config: RunConfig) -> Sequence[str]:
+    """What the environment can draw itself as."""
+    env = make_single(config.env, {**config.env_kwargs, "render_mode": None})
+    try:
+        return list(env.metadata.get("render_modes") or [])
+    finally:
+        env.close()
+
+
+def _refuse_mode(config: RunConfig, mode: str, way_out: str) -> None:
+    modes = _modes(config)
+    if mode not in modes:
+        offered = f"only as {', '.join(modes)}" if modes else "not at all"
+        raise Failure(f"{config.env} cannot draw itself as {mode}, {offered}; {way_out}")
+
+
+def _shown_mode(config: RunConfig, path: Path) -> str:
+    modes = _modes(config)
+    if "human" in modes and _has_display():
+        return "human"
+    if "ansi" in modes:
+        return "ansi"
+    if "human" in modes:
+        raise Failure(f"there is no display to open a window on; film it instead: neuralq record {path} --gif run.gif")
+    way_out = f"film it: neuralq record {path} --gif run.gif" if "rgb_array" in modes else "it draws nothing"
+    raise Failure(f"{config.env} opens no window (it draws itself as: {', '.join(modes) or 'nothing'}); {way_out}")
+
+
+def _has_display() -> bool:
+    """Whether a window would be seen: without one, SDL draws into memory and says nothing."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
+
+
+def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Namespace) -> list[float]:
+    writers = writers_for(options.gif, options.mp4, rate)
+    returns: list[float] = []
+    try:
+        with _bar() as bar:
+            task = bar.add_task("film", total=options.episodes, text="")
+            for moment in game:
+                image = picture(env.render(), caption(moment), options.width)
+                for _ in range(max(1, round(rate)) if moment.over else 1):  # the end stays for a second
+                    for writer in writers:
+                        writer.add(image)
+                if moment.over:
+                    returns.append(moment.episode_return)
+                _advance(bar, task, moment)
+            bar.update(task, text="writing")
+            for writer in writers:
+                writer.close()
+    except BaseException:
+        for writer in writers:
+            writer.discard()
+        raise
+    return returns
+
+
+def _bar() -> Progress:
+    console = Console(stderr=True)
+    columns = (BarColumn(bar_width=24), TextColumn("{task.fields[text]}"))
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _advance(bar: Progress, task: Any, moment: Moment) -> None:
+    bar.update(task, completed=moment.episode - (not moment.over), text=caption(moment))

@@ -1,0 +1,304 @@
+"""Options of ``neuralq train``: preset, then configuration file, then command line, the later winning."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import itertools
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NoReturn, get_args, get_type_hints
+
+import yaml  # type: ignore[import-untyped]
+from jsonargparse import ArgumentParser
+
+from neuralq.apps.cli import Failure
+from neuralq.q.bodies import NAMED_BODIES
+from neuralq.runs import RunConfig, preset_for
+from neuralq.runs.recipe.budget import cut_to_budget
+from neuralq.runs.recipe.config import LAYOUTS, LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
+
+__all__ = ["TrainOptions", "hyphenated", "parse_train"]
+
+_EXAMPLES = """examples:
+  neuralq train CartPole-v1 --seed 3 --stop-at-return 475
+  neuralq train CartPole-v1 --seeds 10
+  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
+  neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
+  neuralq train td-gammon --games 100000  (backgammon; has options of its own)
+  neuralq train my_package:MyEnv-v0 --rollout.lambda 0.8 --hidden 64,64
+  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
+
+_OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
+_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "wandb", "print_config"}
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "dict": "a mapping"}
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What was asked for on the command line, beside the configuration of the run.
+
+    Args:
+        run_dir: folder for the run, or None for one of its own.
+        tensorboard: whether to write event files.
+        wandb: whether to log to Weights & Biases.
+        hook: a hook of the user's own as "module:name", or None.
+        seeds: how many seeds to run side by side, or None for one run.
+        workers: how many of them at a time, or None for as many as there are cores.
+        json: whether to print the result as JSON.
+        preset: whether a preset gave defaults.
+        notes: what was made of schedules that the budget would not have let finish.
+    """
+
+    run_dir: str | None
+    tensorboard: bool
+    wandb: bool
+    hook: str | None
+    seeds: int | None
+    workers: int | None
+    json: bool
+    preset: bool
+    notes: tuple[str, ...]
+
+
+def hyphenated(argv: Sequence[str]) -> list[str]:
+    """``--stop-at-return`` and ``--rollout.lambda`` as the names of their fields; values are left alone.
+
+    Example:
+        >>> hyphenated(["--stop-at-return=475", "--rollout.lambda", "-1"])
+        ['--stop_at_return=475', '--rollout.lambda_', '-1']
+    """
+    out = []
+    for token in argv:
+        match = re.fullmatch(r"--([A-Za-z][\w.-]*)(=.*)?", token, re.DOTALL)
+        if match is None:
+            out.append(token)
+            continue
+        name = re.sub(r"(^|\.)lambda$", r"\1lambda_", match[1].replace("-", "_"))
+        out.append(f"--{name}{match[2] or ''}")
+    return out
+
+
+def _as_typed(text: str) -> str:
+    """Option names in a text of the parser's, with hyphens."""
+    return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text).replace(
+        "--print-config", "--print_config"
+    )
+
+
+class _Parser(ArgumentParser):
+    """Answers wrong usage with one line instead of the list of all options."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        raise Failure(f"{_in_one_line(message)}; `neuralq train --help` lists the options", 2) from ex
+
+
+def _in_one_line(message: str) -> str:
+    key = re.match(r'Parser key "([\w.]+)":', message)
+    got = re.findall(r"(?:Got value|Given value): (.*)", message)
+    if key is None or not got:
+        return _as_typed(" ".join(message.split()))
+    kinds = dict.fromkeys(re.findall(r"<class '(\w+)'>", message.split("Given value")[0]))
+    expected = " or ".join(_WORDS.get(kind, kind) for kind in kinds if kind != "NoneType")
+    name = _as_typed(f"--{key[1]}")
+    return f"{name} must be {expected}, got {got[-1]}" if expected else f"{name}: cannot use {got[-1]}"
+
+
+def _with_env_named(argv: Sequence[str]) -> list[str]:
+    """The one word that is neither an option nor the value of one is the environment, wherever it stands."""
+    out: list[str] = []
+    takes_value = False
+    for token in argv:
+        is_option = token.startswith("-") and not re.fullmatch(r"-\.?\d.*", token)
+        if not is_option and not takes_value:
+            out.append("--env")
+        out.append(token)
+        takes_value = is_option and "=" not in token and token.lstrip("-") not in _WITHOUT_VALUE
+    if out.count("--env") > 1:
+        words = [value for name, value in itertools.pairwise(out) if name == "--env"]
+        raise Failure(f"one environment at a time, got {' and '.join(map(repr, words))}", 2)
+    return out
+
+
+def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list[str]]:
+    """What decides which options there are, the configuration file's content, and the rest of the command line."""
+    light = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    light.add_argument("--config")
+    _, rest = light.parse_known_args(list(argv))
+    for name in ("env", "learner", "layout", "preset"):
+        light.add_argument(f"--{name}")
+    try:
+        known, _ = light.parse_known_args(list(argv))
+    except argparse.ArgumentError as error:
+        raise Failure(f"{error}; `neuralq train --help` lists the options", 2) from error
+    file = {} if known.config is None else _read_file(known.config)
+    for name, default in (("env", ""), ("learner", RunConfig.learner), ("layout", RunConfig.layout)):
+        setattr(known, name, getattr(known, name) or file.get(name) or default)
+    if str(known.learner) not in LEARNERS:  # refused with the right words later
+        known.learner = RunConfig.learner
+    return known, file, rest
+
+
+def _read_file(path: str) -> dict[str, Any]:
+    try:
+        with open(path, encoding="utf-8") as stream:
+            content = yaml.safe_load(stream)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
+    content = {} if content is None else content
+    if not isinstance(content, dict):
+        raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
+    known = [f.name for f in fields(RunConfig)]
+    for name in content:
+        if name not in known:
+            close = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+            raise Failure(f"--config {path} has the unknown key {name!r}; {hint}", 2)
+    return content
+
+
+def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
+    for token in argv:
+        other = re.match(r"--(\w+)[.=]", token)
+        if other is not None and other[1] in LEARNERS and other[1] != learner:
+            option = _as_typed(token.split("=")[0])
+            raise Failure(
+                f"{option} is for the {other[1]} learner, and this is a {learner} run: "
+                f"add --learner {other[1]} or leave it out",
+                2,
+            )
+
+
+def _field_help(settings: type) -> dict[str, str]:
+    """What each field of a dataclass is for, read from its docstring, so that it is written once."""
+    block = re.split(r"\n {4}\w+:", (settings.__doc__ or "").split("Args:")[1])[0]
+    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
+
+
+def _add_fields(parser: Any, settings: type[Any], prefix: str, preset: dict[str, Any]) -> None:
+    texts, types = _field_help(settings), get_type_hints(settings)
+    for f in fields(settings):
+        if prefix or f.name not in _OWN_PARSING:
+            default = preset.get(f.name, f.default)
+            words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
+            kind = next((k for k in (types[f.name], *get_args(types[f.name])) if k in words), str)
+            text = f"{texts[f.name].rstrip('.')} (default: {'none' if default is None else default})".replace("%", "%%")
+            parser.add_argument(f"--{prefix}{f.name}", type=types[f.name], metavar=words[kind], help=text)
+
+
+def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
+    parser = _Parser(
+        prog="neuralq train",
+        usage="neuralq train ENV [options]",
+        description="Train on a Gymnasium environment by TD(λ). ENV is a registered id, or module:id for your own.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        print_config=None,
+    )
+    add = parser.add_argument
+    add("--env", type=str, help=argparse.SUPPRESS)
+    add("--env_kwargs", type=dict, metavar="MAPPING", help="JSON or YAML mapping passed to gymnasium.make")
+    add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
+    add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
+    _add_fields(parser, RunConfig, "", preset)
+    bodies = f"{', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: '{{class: MLP, hidden: [64]}}'"
+    add("--body", type=dict | str | None, metavar="NAME", help=f"network body: {bodies}")
+    add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
+    add("--layer_norm", type=bool | None, metavar="{true,false}", help="layer normalisation in the network")
+    add("--activation", type=str, metavar="NAME", help="relu, tanh or leaky_relu")
+    add("--config", type=str, metavar="FILE", help="YAML file of options, as --print_config writes it")
+    add("--print_config", action="store_true", help="print the resulting configuration and exit")
+    add("--run_dir", type=str, metavar="FOLDER", help="where the run goes (default: a folder under runs/)")
+    add(
+        "--preset",
+        type=bool,
+        metavar="{true,false}",
+        help="whether to start from the environment's preset (default: true)",
+    )
+    add("--seeds", type=int, metavar="N", help="run N seeds, counted from --seed, in processes side by side")
+    add("--workers", type=int, metavar="N", help="how many seeds at a time (default: as many as there are cores)")
+    add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
+    add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
+    add("--hook", type=str, metavar="module:name", help="function or class of your own that takes every row of metrics")
+    add("--json", action="store_true", help="print the result as one JSON object on the last line")
+    group = parser.add_argument_group(f"options of the {learner} learner")
+    _add_fields(group, LEARNERS[learner], f"{learner}.", preset.get(learner, {}))
+    return parser
+
+
+def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
+    """The configuration asked for and the other options; None where printing the options or that was all.
+
+    Raises:
+        Failure: for unknown options, values of the wrong kind and contradictions, with exit status 2.
+    """
+    argv = _with_env_named(hyphenated(argv))
+    known, file, rest = _peek(argv)
+    preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
+    if known.layout not in NETWORKS:  # a preset's body is for networks
+        preset = {name: value for name, value in preset.items() if name != "body"}
+    has_preset = bool(preset)
+    if {"-h", "--help"} & set(rest):
+        print(_as_typed(_build(known.learner, preset).format_help()))
+        return None
+    _refuse_other_learners(rest, known.learner)
+    given = _build(known.learner, preset).parse_args(rest, defaults=False).as_dict()
+    preset, notes = cut_to_budget(preset, {**file, **given, "learner": known.learner})
+    options = TrainOptions(
+        run_dir=given.pop("run_dir", None),
+        tensorboard=given.pop("tensorboard", False),
+        wandb=given.pop("wandb", False),
+        hook=given.pop("hook", None),
+        seeds=given.pop("seeds", None),
+        workers=given.pop("workers", None),
+        json=given.pop("json", False),
+        preset=has_preset,
+        notes=tuple(notes),
+    )
+    _check_counts(options)
+    printed = given.pop("print_config", False)
+    given.pop("preset", None)
+    try:
+        config = config_from_dict(_merged(known.learner, preset, file, given))
+    except ValueError as error:
+        raise Failure(str(error), 2) from error
+    if printed:
+        print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
+        return None
+    return config, options
+
+
+def _check_counts(options: TrainOptions) -> None:
+    for name in ("seeds", "workers"):
+        number = getattr(options, name)
+        if number is not None and number < 1:
+            raise Failure(f"--{name} must be a whole number of at least 1, got {number}", 2)
+    if options.workers is not None and options.seeds is None:
+        raise Failure("--workers says how many seeds run at a time; add --seeds or leave it out", 2)
+
+
+def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Preset, file and command line, the later winning; settings of the learner one by one, everything else whole."""
+    short = {name: given.pop(name) for name in ("hidden", "layer_norm", "activation") if given.get(name) is not None}
+    values = {**preset, **file, **given}
+    if not values.get("env"):
+        raise Failure("name an environment, e.g. neuralq train CartPole-v1", 2)
+    layers = [layer.get(learner) or {} for layer in (preset, file, given)]
+    if all(isinstance(layer, dict) for layer in layers):
+        values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    if "hidden" in short:
+        try:
+            short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]
+        except ValueError as error:
+            raise Failure(f"--hidden takes whole numbers like 64,64, got {short['hidden']!r}", 2) from error
+    if short:
+        body = values.get("body") or {}
+        if isinstance(body, str) and body in NAMED_BODIES:
+            body = body_to_dict(NAMED_BODIES[body])
+        elif isinstance(body, str) and ":" in body:
+            body = {"class": "Custom", "module": body}
+        values["body"] = {"class": "MLP", **body, **short} if isinstance(body, dict) else body
+    return values

@@ -1,0 +1,208 @@
+"""``neuralq train --seeds N``, and ``neuralq resume`` for the sweep that it leaves."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from neuralq.apps.cli import Failure, main, print_result
+from neuralq.apps.cli.options import TrainOptions
+from neuralq.runs import RunConfig
+from neuralq.runs.folder.run_folder import default_run_path, is_run_folder, read_config
+from neuralq.runs.hooks import own_hook
+from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.sweep import (
+    Status,
+    Sweep,
+    SweepResult,
+    create_sweep,
+    is_sweep_folder,
+    num_cores,
+    open_sweep,
+    run_sweep,
+    stop_with_parent,
+)
+from neuralq.runs.sweep.statistics import interquartile_mean
+
+__all__ = ["SweepBar", "child", "is_td_gammon_run", "resume_seeds", "single_run", "started_from", "train_seeds"]
+
+_QUIET_SECONDS = 10.0
+_CHILD = "from neuralq.apps.cli.sweeps import child; child()"
+
+
+def train_seeds(config: RunConfig, options: TrainOptions) -> int:
+    """Run seeds side by side; exit status 0 only if each finished and, where a target was set, reached it."""
+    assert options.seeds is not None
+    single = default_run_path(config.env, config.layout, config.seed, datetime.now())
+    path = Path(options.run_dir or single.with_name(f"sweep-{single.name}"))
+    flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
+    if options.hook is not None:
+        own_hook(options.hook)  # a name that is wrong is one error, not one for each seed
+        flags += ["--hook", options.hook]
+    seeds = range(config.seed, config.seed + options.seeds)
+    sweep = create_sweep(path, config_to_dict(config), seeds, flags)
+    return _run(sweep, options.workers, options.json, started_from(config, options))
+
+
+def started_from(config: RunConfig, options: TrainOptions) -> str:
+    """Where the settings come from that nobody gave, for the first line of a run."""
+    preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
+    if not options.notes:
+        return preset
+    return f"{preset}; within {config.total_steps:,} steps {', '.join(options.notes)}"
+
+
+def resume_seeds(path: str | Path, total_steps: int | None, num_workers: int | None, as_json: bool) -> int:
+    """Go on with a sweep: seeds that have not finished, and those that failed."""
+    return _run(open_sweep(path, total_steps), num_workers, as_json, "")
+
+
+def single_run(path: str) -> Path:
+    """The folder of one run on an environment.
+
+    Raises:
+        Failure: if a sweep is there, whose seeds are runs, or a run of TD-Gammon.
+    """
+    if is_sweep_folder(path):
+        seed = open_sweep(path).seeds[0]
+        raise Failure(f"{path} is a sweep of several runs; name one of them, e.g. {Path(path) / f'seed-{seed}'}", 2)
+    if is_td_gammon_run(path):
+        raise Failure(
+            f"{path} is a TD-Gammon run, which is measured by `neuralq evaluate {path} --against pubeval` and played "
+            f"by `neuralq play backgammon --agent {path}`",
+            2,
+        )
+    return Path(path)
+
+
+def is_td_gammon_run(path: str | Path) -> bool:
+    """Whether a run is there that has learned backgammon, and knows no environment."""
+    return is_run_folder(path) and read_config(path).get("kind") == "td-gammon"
+
+
+def child() -> None:
+    """One seed: the command line in a process that stops with its parent."""
+    stop_with_parent()
+    sys.exit(main(sys.argv[1:]))
+
+
+def _command(sweep: Sweep, seed: int) -> list[str]:
+    begin = [sys.executable, "-c", _CHILD]
+    path = str(sweep.run_path(seed))
+    if is_run_folder(path):
+        options = list(sweep.options)
+        hook = options[(at := options.index("--hook")) : at + 2] if "--hook" in options else []
+        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *hook]
+    config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
+    return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
+
+
+def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:
+    workers = min(num_workers or num_cores(), len(sweep.seeds))
+    print(f"neuralq: sweep folder {sweep.path}{origin}; {len(sweep.seeds)} seeds, {workers} at a time", file=sys.stderr)
+    with SweepBar(len(sweep.seeds)) as bar:
+        result = run_sweep(sweep, _command, num_workers, bar)
+    target = sweep.config.get("stop_at_return")
+    plain = {**result.plain(), "sweep_dir": str(sweep.path)}
+    print_result(plain, as_json, _lines(sweep, result))
+    if result.interrupted_by is not None:
+        print(f"neuralq: {result.interrupted_by}: go on with: neuralq resume {sweep.path}", file=sys.stderr)
+        return 128 + signal.Signals[result.interrupted_by].value
+    failed = [run.seed for run in result.runs if run.state == "failed"]
+    if failed:
+        named = f"seed {failed[0]}" if len(failed) == 1 else f"seeds {', '.join(map(str, failed))}"
+        raise Failure(f"{named} failed, try again with: neuralq resume {sweep.path}")
+    missed = [str(run.seed) for run in result.runs if run.summary.get("reached") is False]
+    if missed:
+        raise Failure(f"the target of {target:g} was not reached by {len(missed)} seeds: {', '.join(missed)}")
+    return 0
+
+
+def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
+    lines = []
+    for run in result.runs:
+        if run.state == "finished":
+            value, seconds = run.summary.get("greedy_return"), run.summary.get("cpu_seconds") or 0.0
+            score = "not evaluated" if value is None else f"greedy return {value:.1f}"
+            lines.append(f"seed {run.seed}: {score}, {run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds")
+        else:
+            log = f" (see {sweep.log_path(run.seed)})" if run.reason else ""
+            lines.append(f"seed {run.seed}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
+    found = result.estimate
+    if found is not None:
+        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {found.iqm:.2f}"
+        if found.low is not None and found.high is not None:
+            text += f", 95 % interval {found.low:.2f} to {found.high:.2f} (stratified bootstrap)"
+        lines.append(text)
+    return [*lines, f"sweep folder {sweep.path}"]
+
+
+class SweepBar:
+    """Progress over all seeds: steps, rate, time left, and the interquartile mean of those that have finished.
+
+    Args:
+        num_seeds: how many there are.
+        stream: where to draw; standard error by default.
+        clock: tells the time in seconds.
+
+    Example:
+        >>> import io
+        >>> out = io.StringIO()
+        >>> with SweepBar(2, out) as bar:
+        ...     bar(Status(50, 200, (1,), 1, (), (31.0,)))
+        >>> out.getvalue().strip()
+        '1 of 2 seeds · 50 of 200 steps · IQM 31.0'
+    """
+
+    def __init__(
+        self, num_seeds: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._console = Console(file=stream or sys.stderr)
+        self._num_seeds, self._clock = num_seeds, clock
+        self._said: tuple[float, int] = (clock(), 0)
+        self._began: tuple[float, int] | None = None
+        self._bar = Progress(
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeRemainingColumn(compact=True),
+            console=self._console,
+            refresh_per_second=4,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("seeds", total=None, text="")
+
+    def __enter__(self) -> SweepBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def __call__(self, status: Status) -> None:
+        """Take in how far the sweep has come."""
+        now = self._clock()
+        self._began = self._began or (now, status.env_steps)
+        parts = [f"{status.num_finished} of {self._num_seeds} seeds"]
+        if status.failed:
+            parts.append(f"failed: {', '.join(map(str, status.failed))}")
+        parts.append(f"{status.env_steps:,} of {status.total_steps:,} steps")
+        if now > self._began[0]:
+            parts.append(f"{(status.env_steps - self._began[1]) / (now - self._began[0]):,.0f} steps/s")
+        if status.returns:
+            parts.append(f"IQM {float(interquartile_mean(status.returns)):.1f}")
+        text = " · ".join(parts)
+        self._bar.update(self._task, completed=status.env_steps, total=status.total_steps, text=text)
+        ended = status.num_finished + len(status.failed)
+        if not self._console.is_terminal and (now - self._said[0] > _QUIET_SECONDS or ended != self._said[1]):
+            self._said = (now, ended)
+            self._console.print(text, highlight=False, soft_wrap=True)

@@ -1,0 +1,126 @@
+"""The page and its API as a Starlette application.
+
+    GET  /               the page             GET  /static/...       its style and its scripts
+    GET  /plotly.min.js  plotly's own script  GET  /api/lab          what can be chosen
+    POST /api/diagnose, /api/run, /api/critical, /api/prescribe      a JSON object each
+
+A request that cannot be understood gets 400, one that is too large 413, one that is no JSON by its own account 415, one
+that asks for something impossible 422, one too many 503, and one that takes too long 504, each with
+``{"error": "..."}``. Nothing is stored and nothing is executed, so a request can at worst cost time, and that is
+bounded by the ranges of the numbers, by a deadline, and by the number of worker processes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from neuralq.apps.web.catalogue import catalogue
+from neuralq.apps.web.pool import Busy, Left, Pool, TooLong
+from neuralq.apps.web.requests import ANSWERS, read_request
+from neuralq.apps.web.shell import Guard, Malformed, failure, http_error, read_body, read_json
+
+__all__ = ["application"]
+
+NUM_WORKERS = 3
+_STATIC = Path(__file__).parent / "static"
+_MOST_REMEMBERED = 256
+
+
+def application(names: frozenset[str], *, any_address: bool, plotly_script: Path) -> Starlette:
+    """The application.
+
+    Args:
+        names: hosts that it answers to, in lower case.
+        any_address: whether it answers to every address given as a number as well.
+        plotly_script: plotly's script.
+
+    Example:
+        >>> application(frozenset({"localhost"}), any_address=False, plotly_script=Path("plotly.min.js")).debug
+        False
+    """
+
+    async def page(request: Request) -> Response:
+        return FileResponse(_STATIC / "index.html")
+
+    async def script(request: Request) -> Response:
+        return FileResponse(plotly_script, media_type="text/javascript")
+
+    async def chosen(request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(catalogue))
+
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/plotly.min.js", script),
+            Route("/api/lab", chosen),
+            *(Route(f"/api/{kind}", _answer, methods=["POST"]) for kind in ANSWERS),
+            Mount("/static", StaticFiles(directory=_STATIC)),
+        ],
+        middleware=[Middleware(Guard, names=names, any_address=any_address)],
+        exception_handlers={HTTPException: http_error, Exception: failure},
+        lifespan=_lifespan,
+    )
+
+
+@asynccontextmanager
+async def _lifespan(app: Starlette) -> AsyncIterator[None]:
+    app.state.pool = Pool(NUM_WORKERS)
+    app.state.remembered = OrderedDict()
+    building = asyncio.ensure_future(run_in_threadpool(catalogue))  # a second that the first visitor need not wait
+    await app.state.pool.warm()
+    try:
+        yield
+    finally:
+        await building
+        await app.state.pool.close()
+
+
+async def _answer(request: Request) -> Response:
+    """Check a request, and have a worker answer it unless the answer is known."""
+    kind = request.url.path.rpartition("/")[2]
+    try:
+        spec = read_request(kind, read_json(await read_body(request)))
+    except Malformed as error:
+        raise HTTPException(400, str(error)) from None
+    except ValueError as error:
+        raise HTTPException(422, str(error)) from None
+    known: OrderedDict[str, Response] = request.app.state.remembered
+    key = f"{kind} {spec}"
+    if key not in known:
+        status, found = await _asked(request, kind, spec)
+        if status >= 500:
+            raise HTTPException(status, found["error"])
+        known[key] = JSONResponse(found, status)
+        while len(known) > _MOST_REMEMBERED:
+            known.popitem(last=False)
+    return Response(known[key].body, known[key].status_code, media_type="application/json")
+
+
+async def _asked(request: Request, kind: str, spec: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+    pool: Pool = request.app.state.pool
+    try:
+        return await pool.ask(kind, spec, request.is_disconnected)
+    except Busy:
+        raise HTTPException(503, "too many computations are waiting; try again in a moment") from None
+    except TooLong:
+        raise HTTPException(
+            504, f"this takes more than {pool.deadline_seconds:g} s; from Python it may take as long as it likes"
+        ) from None
+    except Left:
+        raise HTTPException(499, "who asked went away") from None
+    except (ValueError, OSError) as error:  # the worker died in between: killed for its memory, for example
+        raise HTTPException(500, "the computation ended early; ask again") from error

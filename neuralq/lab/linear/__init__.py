@@ -1,0 +1,1 @@
+"""Linear prediction as one affine process: its matrices, its samples and its spectrum."""

@@ -1,0 +1,125 @@
+"""Transitions for many independent seeds at once: independent draws, or chains that follow the behaviour policy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuralq.lab.linear.process import Arcs, Process
+
+__all__ = ["Sample", "Sampling", "sample_of_arcs", "stream"]
+
+Floats = NDArray[np.float64]
+Index = NDArray[np.int64]
+Sampling = Literal["expected", "iid", "markov"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sample:
+    """One transition for each of N seeds.
+
+    Args:
+        row: where it starts, ``[N]``.
+        next_row: where it leads, -1 at an end, ``[N]``.
+        x: features of the row, ``[N, d]``.
+        x_next: features of the next row, 0 at an end, ``[N, d]``.
+        x_second: features of a second, independent successor under the *target* policy, 0 at an end, ``[N, d]``.
+        discount_second: γ, or 0 where that second successor is an end, ``[N]``.
+        reward: ``[N]``.
+        rho: importance ratio of the transition, ``[N]``.
+        discount: γ, or 0 at an end, ``[N]``.
+        begins: whether an episode begins here, so that traces start anew, ``[N]``.
+    """
+
+    row: Index
+    next_row: Index
+    x: Floats
+    x_next: Floats
+    x_second: Floats
+    discount_second: Floats
+    reward: Floats
+    rho: Floats
+    discount: Floats
+    begins: NDArray[np.bool_]
+
+
+def sample_of_arcs(process: Process, arc: Index, second: Index, begins: NDArray[np.bool_]) -> Sample:
+    """The transitions along given arcs of the behaviour, with second successors along given arcs of the target.
+
+    Args:
+        process: the problem.
+        arc: indices into ``process.arcs``, ``[N]``.
+        second: indices into ``process.target_arcs``, of the same rows, ``[N]``.
+        begins: ``[N]``.
+    """
+    arcs, target = process.arcs, process.target_arcs
+    row, next_row = arcs.row[arc], arcs.next_row[arc]
+    return Sample(
+        row,
+        next_row,
+        process.X[row],
+        _features(process, next_row),
+        _features(process, target.next_row[second]),
+        target.discount[second],
+        arcs.reward[arc],
+        arcs.rho[arc],
+        arcs.discount[arc],
+        begins,
+    )
+
+
+def stream(
+    process: Process, sampling: Literal["iid", "markov"], num_seeds: int, rng: np.random.Generator
+) -> Iterator[Sample]:
+    """Transitions without end for ``num_seeds`` independent seeds.
+
+    * ``"iid"``: every row is drawn from D anew, so nothing connects one transition to the next.
+    * ``"markov"``: chains begin at a row drawn from D and follow the behaviour policy; after an end they go on from the
+      start distribution.
+
+    Example:
+        >>> from neuralq.lab.linear.process import linear_process
+        >>> from neuralq_envs.counterexamples import star
+        >>> samples = stream(linear_process(star()), "markov", 3, np.random.default_rng(0))
+        >>> one, two = next(samples), next(samples)
+        >>> bool((one.next_row == two.row).all()), one.begins.tolist(), two.begins.tolist()
+        (True, [True, True, True], [False, False, False])
+    """
+    visits, start = np.cumsum(process.D), np.cumsum(process.start)
+    row = _draw(visits, rng.random(num_seeds))
+    begins = np.ones(num_seeds, dtype=bool)
+    while True:
+        arc = _climb(process.arcs, row, rng.random(num_seeds))
+        second = _climb(process.target_arcs, row, rng.random(num_seeds))
+        sample = sample_of_arcs(process, arc, second, begins)
+        yield sample
+        if sampling == "iid":
+            row = _draw(visits, rng.random(num_seeds))
+            continue
+        ended = sample.next_row < 0
+        if ended.any():
+            row = np.where(ended, _draw(start, rng.random(num_seeds)), sample.next_row)
+        else:
+            row = sample.next_row
+        begins = ended
+
+
+def _features(process: Process, row: Index) -> Floats:
+    x = process.X[row]
+    x[row < 0] = 0.0
+    return x
+
+
+def _draw(cumulative: Floats, u: Floats) -> Index:
+    """Indices with the chances whose running sum is given; never one of chance 0."""
+    return np.asarray(np.searchsorted(cumulative, u * cumulative[-1], side="right"), dtype=np.int64)
+
+
+def _climb(arcs: Arcs, row: Index, u: Floats) -> Index:
+    """An arc of each row with its chance."""
+    found: Index = np.minimum(np.searchsorted(arcs.ladder, row + u, side="right"), arcs.starts[row + 1] - 1)
+    return found

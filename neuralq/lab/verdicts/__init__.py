@@ -1,0 +1,1 @@
+"""Verdicts on an update: growth, moments, critical values, and what to change."""

@@ -1,0 +1,1 @@
+"""Watching a run for divergence: growth of its errors, and advice."""

@@ -1,0 +1,332 @@
+"""A hook that watches a run for divergence: what is measured, what the tangent kernel says, and what to change.
+
+Three signs, from the surest to the earliest:
+
+* *Soft divergence* (van Hasselt et al. 2018): no return can exceed r_max / (1 − γ), so a |Q| above it is wrong.
+* *Explosive growth* of |δ| or |Q|: an exponential that does not slow down, over the last rows of metrics.
+* *The kernel*: on transitions of late, would plain one-step updates make errors grow (`neuralq.lab.networks.sampled`)?
+  Local
+  and only a warning: what stabilises the run may be what the kernel leaves out. It must say so several times in a row.
+
+The monitor reads and never writes: it draws from a generator of its own, works on copies, and a run ends with the same
+bits with and without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuralq.checks import check_positive, check_whole
+from neuralq.lab.networks.sampled import SampleDiagnosis, diagnose_sample
+from neuralq.lab.watch.advice import RunTraits, advise
+from neuralq.lab.watch.growth import GrowthFit, fit_growth
+from neuralq.learners import Learner
+from neuralq.runs import RunConfig
+from neuralq.runs.stream.experience import Sample
+from neuralq.types import QFunction, Transition
+
+__all__ = ["Alarm", "DivergenceMonitor", "DivergenceWarning"]
+
+_PERSISTENT = 3  # unstable kernels in a row before the alarm: one may be chance
+_MOST_NUMBERS = 4e7  # entries of the Jacobians of a sample; a larger network gets a smaller sample
+_MEASURES = {"abs_td_error": "The mean TD error", "largest_value": "The largest |Q|"}
+
+
+class DivergenceWarning(UserWarning):
+    """A run looks as if it diverges."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """One sign of divergence, the first of its kind in a run.
+
+    Args:
+        kind: "soft divergence", "growth of abs_td_error", "growth of largest_value", "kernel" or "not finite".
+        env_steps: when it was raised.
+        message: what was seen.
+        advice: what to change, most promising first.
+    """
+
+    kind: str
+    env_steps: int
+    message: str
+    advice: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """What was seen and what to change."""
+        return f"{self.message} What may help: {'; '.join(self.advice)}."
+
+
+class DivergenceMonitor:
+    """Warns at most once of each sign of divergence, and leaves a report.
+
+    Args:
+        traits: what the run is like, as far as it matters; `RunTraits` or `DivergenceMonitor.of(config)`.
+        largest_reward: the largest |r| the environment gives, in its own units; None takes the largest seen so far.
+        margin: |Q| must exceed the bound by this factor; 1 is the published criterion, and noisy where returns come
+            close to the bound.
+        num_samples: transitions B on which the kernel is computed; fewer for large networks.
+        every: rows of metrics between two kernels; each costs about 2 B gradients. 0 for none.
+        window: rows over which growth is fitted.
+        seed: of the generator that picks the transitions.
+
+    Raises:
+        ValueError: an argument out of range.
+
+    Example:
+        >>> monitor = DivergenceMonitor(RunTraits(gamma=0.9, step_size=0.1), largest_reward=1.0)
+        >>> with warnings.catch_warnings(record=True) as caught:
+        ...     warnings.simplefilter("always")
+        ...     monitor({"kind": "train", "env_steps": 64, "max_q": 50.0})
+        >>> monitor.alarms[0].kind, len(caught)
+        ('soft divergence', 1)
+    """
+
+    def __init__(
+        self,
+        traits: RunTraits,
+        *,
+        largest_reward: float | None = None,
+        margin: float = 1.1,
+        num_samples: int = 32,
+        every: int = 10,
+        window: int = 20,
+        seed: int = 0,
+    ) -> None:
+        if largest_reward is not None:
+            check_positive("largest_reward", largest_reward)
+        if not margin >= 1:
+            raise ValueError(f"margin must be at least 1, got {margin!r}")
+        check_whole("num_samples", num_samples, 2)
+        check_whole("every", every, 0)
+        check_whole("window", window, 8)
+        check_whole("seed", seed, 0)
+        self.traits = traits
+        self.alarms: list[Alarm] = []
+        self.diagnoses: list[tuple[int, SampleDiagnosis]] = []
+        self._given, self._margin = largest_reward, margin
+        self._num_samples, self._every = num_samples, every
+        self._rng = np.random.default_rng(seed)
+        self._rows: deque[tuple[float, dict[str, float]]] = deque(maxlen=window)
+        self._recent: Transition | None = None
+        self._latest: SampleDiagnosis | None = None
+        self._looks = 0
+        self._seen_bound = 0.0
+        self._value_now: float | None = None
+        self._largest_value = 0.0
+        self._env_steps = 0
+        self.unavailable: str | None = None
+        """Why there is no kernel, where there is none."""
+
+    @classmethod
+    def of(cls, config: RunConfig, *, largest_reward: float | None = None) -> DivergenceMonitor:
+        """A monitor for the run that a configuration describes.
+
+        Example:
+            >>> DivergenceMonitor.of(RunConfig()).traits.lambda_
+            0.65
+        """
+        return cls(RunTraits.of(config), largest_reward=largest_reward)
+
+    @property
+    def bound(self) -> float | None:
+        """r_max / (1 − γ), in the learner's units; None without a reward or without discounting."""
+        if self.traits.gamma == 1:
+            return None
+        if self._given is not None:
+            return self._given * self.traits.reward_scale / (1 - self.traits.gamma)
+        return self._seen_bound or None
+
+    def observe(self, learner: Learner, sample: Sample) -> None:
+        """Read the learner's Q-function on what it last learned from; called by `neuralq.train` before each row."""
+        rows = _held_rows(sample)
+        if not len(rows.a_tm1):
+            return
+        self._note_rewards(rows)
+        few = self._rng.permutation(len(rows.a_tm1))[: self._num_samples]
+        rows = rows.map(lambda x: x[torch.from_numpy(few).to(x.device)].cpu())
+        if self._recent is not None:
+            rows = Transition(
+                *(
+                    torch.cat([getattr(self._recent, f.name), getattr(rows, f.name)])[-self._num_samples :]
+                    for f in fields(Transition)
+                )
+            )
+        self._recent = rows
+        q = learner.engine.q
+        self._value_now = _largest_value(q, rows)
+        if self._every and self._looks % self._every == 0 and len(rows.a_tm1) >= min(self._num_samples, 8):
+            self._latest = self._try_inspect(q, rows)
+        self._looks += 1
+
+    def inspect(self, q: QFunction, transitions: Transition, env_steps: int | None = None) -> SampleDiagnosis:
+        """The kernel's verdict on transitions of your own, which joins the report.
+
+        Args:
+            q: any `QFunction` module; it is only read.
+            transitions: at least 2.
+            env_steps: when; default: that of the last row.
+
+        Raises:
+            ValueError: fewer than 2 transitions.
+        """
+        found = diagnose_sample(
+            cast(nn.Module, q), transitions, self.traits.step_size, reward_scale=self.traits.reward_scale
+        )
+        self._take(found, self._env_steps if env_steps is None else env_steps)
+        return found
+
+    def __call__(self, row: Mapping[str, Any]) -> None:
+        """Take in a row of metrics and raise what alarms are due."""
+        self._env_steps = int(row.get("env_steps", self._env_steps))
+        latest, self._latest = self._latest, None
+        if latest is not None:
+            self._take(latest, self._env_steps)
+        if row.get("kind") == "train":
+            self._measure(row)
+
+    def _measure(self, row: Mapping[str, Any]) -> None:
+        value = self._value_now if self._value_now is not None else _absolute(row.get("max_q"))
+        measured = {"abs_td_error": _absolute(row.get("abs_td_error")), "largest_value": value}
+        known = {name: x for name, x in measured.items() if x is not None}
+        for name, x in known.items():
+            if not math.isfinite(x):
+                self._raise("not finite", f"{_MEASURES[name]} is no longer a finite number.")
+        finite = {name: x for name, x in known.items() if math.isfinite(x)}
+        if not finite:
+            return
+        self._rows.append((float(row.get("num_updates", row["env_steps"])), finite))
+        self._largest_value = max(self._largest_value, finite.get("largest_value", 0.0))
+        self._check_bound(finite.get("largest_value"))
+        for name in _MEASURES:
+            self._check_growth(name)
+
+    def _check_bound(self, value: float | None) -> None:
+        bound = self.bound
+        if value is not None and bound is not None and value > self._margin * bound:
+            whose = "given" if self._given is not None else "seen so far"
+            self._raise(
+                "soft divergence",
+                f"The largest |Q| is {value:.4g}, but with the largest reward {whose} and γ={self.traits.gamma:g} no "
+                f"return exceeds r_max/(1 − γ) = {bound:.4g}.",
+            )
+
+    def _check_growth(self, name: str) -> None:
+        found, bound = self.growth(name), self.bound
+        if found is None or not found.explosive or len(self._rows) < (self._rows.maxlen or 0):
+            return
+        if bound is not None and self._rows[-1][1].get(name, 0.0) < 0.1 * bound:
+            return  # values that start at 0 have to grow
+        doubling = found.doubling or math.inf
+        self._raise(
+            f"growth of {name}",
+            f"{_MEASURES[name]} rose {found.rise:.3g}-fold over the last {len(self._rows)} rows without "
+            f"slowing down: it doubles every {doubling:.3g} updates.",
+        )
+
+    def growth(self, measure: str = "abs_td_error") -> GrowthFit | None:
+        """The geometric curve through the last rows of "abs_td_error" or "largest_value", per update."""
+        kept = [(at, row[measure]) for at, row in self._rows if measure in row]
+        return fit_growth([at for at, _ in kept], [y for _, y in kept])
+
+    def _take(self, found: SampleDiagnosis, env_steps: int) -> None:
+        self.diagnoses.append((env_steps, found))
+        last = [diagnosis for _, diagnosis in self.diagnoses[-_PERSISTENT:]]
+        if len(last) == _PERSISTENT and all(one.unstable for one in last):
+            self._raise("kernel", found.explain())
+        if self.traits.plain_steps and len(last) == _PERSISTENT and all(one.too_large_step for one in last):
+            self._raise("kernel", found.explain())
+
+    def _raise(self, kind: str, message: str) -> None:
+        if any(alarm.kind == kind for alarm in self.alarms):
+            return
+        latest = self.diagnoses[-1][1] if self.diagnoses else None
+        alarm = Alarm(kind, self._env_steps, message, advise(self.traits, latest))
+        self.alarms.append(alarm)
+        # Where warnings are errors the alarm is still in the report, and the run goes on: a monitor changes nothing.
+        with contextlib.suppress(DivergenceWarning):
+            warnings.warn(f"after {self._env_steps:,} steps: {alarm}", DivergenceWarning, stacklevel=3)
+
+    def _try_inspect(self, q: QFunction, rows: Transition) -> SampleDiagnosis | None:
+        module = cast(nn.Module, q)
+        size = sum(p.numel() for p in module.parameters())
+        few = max(2, min(len(rows.a_tm1), int(_MOST_NUMBERS / (2 * size))))
+        try:
+            return diagnose_sample(
+                module, rows.map(lambda x: x[-few:]), self.traits.step_size, reward_scale=self.traits.reward_scale
+            )
+        except (RuntimeError, NotImplementedError, TypeError, ValueError) as error:  # a module vmap cannot run, or NaN
+            self.unavailable = str(error).strip().split("\n")[0]
+            return None
+
+    def _note_rewards(self, rows: Transition) -> None:
+        gamma = self.traits.gamma
+        if gamma == 1:
+            return
+        size = rows.r_t.double().abs() * self.traits.reward_scale
+        # A row of n steps is discounted by γⁿ: |Σ γᵏ r| / (1 − γⁿ) ≤ r_max / (1 − γ).
+        share = torch.where(rows.discount_t > 0, 1 - rows.discount_t.double(), 1 - gamma)
+        self._seen_bound = max(self._seen_bound, float((size / share.clamp(min=1 - gamma)).max()))
+
+    def report(self) -> dict[str, Any]:
+        """What was seen, as plain values for JSON."""
+        fits = {name: self.growth(name) for name in _MEASURES}
+        return {
+            "env_steps": self._env_steps,
+            "alarms": [asdict(alarm) for alarm in self.alarms],
+            "largest_value": self._largest_value,
+            "bound": self.bound,
+            "growth": {name: None if fit is None else asdict(fit) for name, fit in fits.items()},
+            "kernels": [{"env_steps": at, "verdict": one.verdict} | _plain(one) for at, one in self.diagnoses],
+            "kernel_unavailable": self.unavailable,
+        }
+
+    def explain(self) -> str:
+        """What was seen and what to change, in a paragraph or two."""
+        parts = [f"{self._env_steps:,} steps watched: " + ("no alarm." if not self.alarms else "")]
+        parts += [f"[{alarm.kind}, at {alarm.env_steps:,} steps] {alarm.message}" for alarm in self.alarms]
+        if not self.alarms and self.bound is not None:
+            parts.append(f"The largest |Q| was {self._largest_value:.4g} of at most {self.bound:.4g}.")
+        if self.diagnoses and not any(alarm.kind == "kernel" for alarm in self.alarms):
+            parts.append(self.diagnoses[-1][1].explain())
+        if self.unavailable is not None:
+            parts.append(f"The kernel could not be computed: {self.unavailable}.")
+        if self.alarms:
+            parts.append(f"What may help: {'; '.join(self.alarms[-1].advice)}.")
+        return " ".join(part.strip() for part in parts)
+
+
+def _plain(found: SampleDiagnosis) -> dict[str, Any]:
+    """Plain values, None for what is not a finite number, which JSON does not have."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(found).items()}
+
+
+def _absolute(value: Any) -> float | None:
+    return None if value is None else abs(float(value))
+
+
+def _held_rows(sample: Sample) -> Transition:
+    """The rows that are experience, with one leading axis."""
+    axes = sample.transition.a_tm1.dim()
+    flat = sample.transition.map(lambda x: x.reshape(-1, *x.shape[axes:]))
+    if sample.weight is None or sample.indices is not None:
+        return flat
+    return flat.map(lambda x: x[sample.weight.reshape(-1).to(x.device) > 0])
+
+
+def _largest_value(q: QFunction, rows: Transition) -> float:
+    device = next(cast(nn.Module, q).parameters()).device
+    with torch.no_grad():
+        values: Tensor = q.all(rows.s_tm1.to(device)).double().abs()
+    legal = values[~torch.isposinf(values)] if bool(torch.isinf(values).any()) else values
+    return float(legal.max()) if legal.numel() else 0.0

@@ -1,0 +1,89 @@
+"""What a run by gradient TD may be told: QRC(λ) with its published numbers, or GQ(λ)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners.gradient.step import GradientTDSettings
+
+__all__ = ["GradientSettings"]
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """How a `GradientQLearner` learns in a run. What is None is filled in with the method's own value.
+
+    Args:
+        method: "qrc" (QRC(λ), Elelimy et al. 2025) or "gq" (GQ(λ), Maei & Sutton 2010; with λ = 0 and a greedy target
+            policy it is Greedy-GQ, Maei et al. 2010).
+        lambda_: λ in [0, 1]; None for 0.8 (qrc), 0 (gq, whose traces grow with 1/μ: λ/μ below 1 keeps them bounded).
+        step_size: α of the values.
+        step_size_h: α_h of the second function; None for a tenth of the step size, as published for qrc.
+        beta: β ≥ 0, how strongly the second function is pulled to 0; None for 1 (qrc), 0 (gq).
+        cut: of qrc's traces, "watkins" (at exploring actions) or "naive" (never); None for "watkins".
+        target_epsilon: ε of gq's ε-greedy target policy; None for 0, the greedy one.
+        normalise_observations: by their running mean and spread; None does so unless they are state indices.
+        scale_rewards: by the running spread of their discounted sum.
+
+    Raises:
+        ValueError: for values outside their range, or that the method has no use for.
+
+    Source: the defaults of QRC(λ) are those of Elelimy et al. 2025 on MinAtar: α = 1e-4, α_h = 1e-5, β = 1, λ = 0.8,
+    observations normalised and rewards scaled. Of GQ(λ) on networks no numbers are published.
+
+    Example:
+        >>> settings = GradientSettings()
+        >>> settings.lambda_, settings.step_size_h, settings.beta
+        (0.8, 1e-05, 1.0)
+        >>> GradientSettings(method="gq").beta
+        0.0
+    """
+
+    method: str = "qrc"
+    lambda_: float | None = None
+    step_size: float = 1e-4
+    step_size_h: float | None = None
+    beta: float | None = None
+    cut: str | None = None
+    target_epsilon: float | None = None
+    normalise_observations: bool | None = None
+    scale_rewards: bool = True
+
+    def __post_init__(self) -> None:
+        """Fill in what is left out; refuse values outside their range and those that would be ignored."""
+        check_choice("method", self.method, ("qrc", "gq"))
+        qrc = self.method == "qrc"
+        if not qrc and self.cut is not None:
+            raise ValueError(
+                f"cut={self.cut!r} would be ignored: method='gq' cuts its traces by the importance ratio of its target "
+                "policy; leave cut out"
+            )
+        if qrc and self.target_epsilon is not None:
+            raise ValueError(
+                f"target_epsilon={self.target_epsilon!r} would be ignored: method='qrc' bootstraps from the best "
+                "action; use method='gq' or leave target_epsilon out"
+            )
+        check_positive("step_size", self.step_size)
+        self._settle("lambda_", 0.8 if qrc else 0.0)
+        self._settle("step_size_h", round(0.1 * self.step_size, 15))
+        self._settle("beta", 1.0 if qrc else 0.0)
+        if qrc:
+            self._settle("cut", "watkins")
+        else:
+            self._settle("target_epsilon", 0.0)
+            check_fraction("target_epsilon", self.target_epsilon)  # type: ignore[arg-type]
+        _ = self.rule  # checks the rest
+
+    def _settle(self, name: str, value: Any) -> None:
+        if getattr(self, name) is None:
+            object.__setattr__(self, name, value)
+
+    @property
+    def rule(self) -> GradientTDSettings:
+        """The settings of the learner itself."""
+        assert self.lambda_ is not None and self.step_size_h is not None and self.beta is not None
+        return GradientTDSettings(
+            "tdc", self.lambda_, self.step_size, self.step_size_h, self.beta, self.cut or "watkins"
+        )

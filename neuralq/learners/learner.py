@@ -1,0 +1,132 @@
+"""What an update returns, and the descent step that batch learners share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq.checks import check_positive
+from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.q.engine import Engine, on_arrays
+from neuralq.types import Metrics, Transition
+
+__all__ = ["Descent", "Learner", "Update"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What one update saw; metrics are computed only when asked for.
+
+    Args:
+        errors: target − Q(s, a) of the samples last used, ``[B]``.
+        targets: their targets, ``[B]``.
+    """
+
+    errors: Tensor
+    targets: Tensor
+
+    def metrics(self) -> Metrics:
+        """``loss`` ½·mean(e²), ``abs_td_error`` mean |e| and ``max_q``, the largest target."""
+        errors = self.errors.double()
+        return {
+            "loss": float(0.5 * (errors * errors).mean()),
+            "abs_td_error": float(errors.abs().mean()),
+            "max_q": float(self.targets.max()),
+        }
+
+
+class Learner(Protocol):
+    """What training asks of a learner."""
+
+    engine: Engine
+
+    @property
+    def num_updates(self) -> int:
+        """How many updates there have been."""
+        ...
+
+    def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
+        """Learn from experience; ``weight`` has one entry per row, 0 for rows that are no experience, on any device."""
+        ...
+
+    def begin_streams(self) -> None:
+        """Every stream of experience starts anew: forget what connects one step to the next."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a continued run needs."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        ...
+
+
+class Descent:
+    """Clipped steps of an optimiser along the engine's gradient, with the learning rate annealed linearly if asked.
+
+    ``on_arrays`` is the engine where it computes from arrays to arrays: at an update per environment step, making
+    tensors of them would cost as much as the arithmetic.
+
+    Args:
+        engine: whose flat vector is changed.
+        optimiser: which optimiser.
+        learning_rate: at the first step.
+        max_grad_norm: bound on the gradient's Euclidean norm; None for no bound.
+    """
+
+    def __init__(self, engine: Engine, optimiser: Optimiser, learning_rate: float, max_grad_norm: float | None) -> None:
+        check_positive("learning_rate", learning_rate)
+        if max_grad_norm is not None:
+            check_positive("max_grad_norm", max_grad_norm)
+        self.engine = engine
+        self.learning_rate = learning_rate
+        self.max_grad_norm = max_grad_norm
+        self._state = FlatOptimiser(optimiser, engine.flat.values)
+        self.on_arrays = on_arrays(engine)
+
+    def step(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, scale: float = 1.0) -> Tensor:
+        """One step on the weighted loss; returns the errors before it, ``[B]``."""
+        errors = self.engine.loss_gradient(s, a, target, weight)
+        self.follow(scale)
+        return errors
+
+    def step_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None, scale: float = 1.0) -> _Array:
+        """As `step`, with arrays ``[B]``, where `on_arrays` is not None."""
+        assert self.on_arrays is not None
+        errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)
+        self.follow(scale)
+        return errors
+
+    def follow(self, scale: float = 1.0) -> None:
+        """One step along the gradient that lies in the engine's flat vector, wherever it came from."""
+        flat = self.engine.flat
+        grad = flat.grad if flat.grad_array is None else flat.grad_array
+        if self.max_grad_norm is not None:
+            clip_norm_(grad, self.max_grad_norm)
+        self._state.step(grad, self.learning_rate * scale)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, their target copy and the optimiser."""
+        return {
+            "parameters": self.engine.flat.values,
+            "target": self.engine.target_values(),
+            "optimiser": self._state.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.engine.flat.load(torch.as_tensor(state["parameters"]))
+        self._state.load_state_dict(state["optimiser"])
+        if state["target"] is not None:
+            self.engine.sync_target()
+            target = self.engine.target_values()
+            assert target is not None
+            target.copy_(state["target"])

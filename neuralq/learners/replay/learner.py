@@ -1,0 +1,165 @@
+"""Q-learning from stored experience: one-step, n-step, double and Munchausen targets, or λ-returns over blocks.
+
+One-step and n-step samples come ready from the replay buffer (its discount is that of the whole stretch), so the same
+rule serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in DQN(λ) (Daley & Amato, 2019): Peng's and
+Watkins', or with the corrections of Retrace, tree backup or Q(λ) towards an ε-greedy target policy. Of the policy that
+took the stored actions these know only the probabilities stored with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq import rules
+from neuralq.learners.learner import Descent, Update
+from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.settings import CORRECTED_RULES, ReplaySettings
+from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
+from neuralq.q.engine import Engine
+from neuralq.types import Transition
+
+__all__ = ["ReplayLearner"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class ReplayLearner:
+    """Q-learning on samples ``[B]`` or blocks ``[T, B]`` with a target network.
+
+    Args:
+        engine: values and gradients of the representation, with the loss in it.
+        settings: how to learn.
+        reward_scale: rewards are multiplied by it, so values are too.
+
+    Raises:
+        ValueError: for settings that another learner is for: a distribution, or "dqrc".
+
+    Example:
+        >>> import torch
+        >>> from neuralq.q import TableQ
+        >>> from neuralq.q.engine import Loss, TorchEngine
+        >>> settings = ReplaySettings(optimiser="sgd", learning_rate=1.0, loss="squared")
+        >>> learner = ReplayLearner(TorchEngine(TableQ(2, 1), Loss()), settings)
+        >>> one = torch.ones(1)
+        >>> step = Transition(torch.tensor([0]), torch.tensor([0]), one, 5 * one, 0 * one, torch.tensor([1]), one > 0)
+        >>> learner.update(step).errors.tolist(), learner.engine.all(torch.tensor(0)).item()
+        ([5.0], 5.0)
+    """
+
+    def __init__(self, engine: Engine, settings: ReplaySettings, reward_scale: float = 1.0) -> None:
+        if settings.distribution != "none" or settings.target_rule == "dqrc":
+            raise ValueError(
+                f"a ReplayLearner learns means from frozen targets, got distribution={settings.distribution!r} and "
+                f"target_rule={settings.target_rule!r}; use DistributionalLearner or DQRCLearner"
+            )
+        self.engine = engine
+        self.settings = settings
+        self.reward_scale = reward_scale
+        self.num_updates = 0
+        self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._seen: Transition | None = None
+        self._seen_arrays: tuple[_Array, ...] | None = None
+        engine.sync_target()
+        one = torch.ones(1, dtype=engine.flat.values.dtype)
+        q_learning_targets(one, one, one[:, None])  # compiled here, so that a run's clock measures training
+
+    def targets(self, transition: Transition) -> Tensor:
+        """Targets of the chosen rule, with the shape of ``r_t``."""
+        q_t = self.engine.all(transition.s_t, target=True)
+        rule = self.settings.target_rule
+        if rule == "q_learning":
+            return q_learning_targets(transition.r_t, transition.discount_t, q_t, self.reward_scale)
+        r_t = transition.r_t.to(q_t.dtype) * self.reward_scale
+        discount_t = transition.discount_t.to(q_t.dtype)
+        if rule == "double":
+            return rules.double_q(r_t, discount_t, q_t, self.engine.all(transition.s_t))
+        if rule in ("peng", "watkins"):
+            return rules.lambda_returns(r_t, discount_t, q_t.amax(-1), self._lambda(transition, q_t), transition.last_t)
+        q_tm1 = self.engine.all(transition.s_tm1, target=True)
+        a_tm1 = transition.a_tm1
+        if rule == "munchausen":
+            return rules.munchausen(r_t, discount_t, q_tm1, a_tm1, q_t, *self.settings.munchausen_numbers)
+        epsilon = self.settings.target_epsilon
+        assert rule in CORRECTED_RULES and epsilon is not None
+        v_t = rules.expected_value(q_t, rules.epsilon_greedy(q_t, epsilon))
+        c_tm1 = self._coefficients(q_tm1, epsilon, transition)
+        chosen = q_tm1.gather(-1, a_tm1[..., None])[..., 0]
+        return rules.off_policy_returns(chosen, r_t, discount_t, v_t, c_tm1, transition.last_t)
+
+    def _lambda(self, transition: Transition, q_t: Tensor) -> Tensor | float:
+        """Peng's λ, the same everywhere, or Watkins', cut where the next action was not greedy."""
+        if self.settings.target_rule == "peng":
+            return self.settings.lambda_
+        greedy = rules.is_greedy(self.engine.all(transition.s_tm1, target=True), transition.a_tm1)
+        return rules.watkins_lambda(self.settings.lambda_, greedy, q_t.dtype)
+
+    def _coefficients(self, q_tm1: Tensor, epsilon: float, transition: Transition) -> Tensor:
+        """How far the errors behind each row's action are followed."""
+        rule, lambda_ = self.settings.target_rule, self.settings.lambda_
+        if rule == "harutyunyan":
+            return torch.full_like(q_tm1[..., 0], lambda_)
+        pi = rules.epsilon_greedy(q_tm1, epsilon).gather(-1, transition.a_tm1[..., None])[..., 0]
+        if rule == "tree_backup":
+            return rules.tree_backup_coefficients(lambda_, pi)
+        return rules.retrace_coefficients(lambda_, pi, transition.mu_tm1)
+
+    def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
+        """One descent step on a batch; ``weight``, shaped like ``r_t``, multiplies each sample's loss."""
+        arrays = self._arrays_of(transition)
+        if arrays is not None:
+            return self._update_arrays(arrays, None if weight is None else weight.to(transition.r_t.dtype).numpy())
+        targets = self.targets(transition)
+        s, a = transition.s_tm1, transition.a_tm1
+        weight = None if weight is None else weight.to(targets.device)
+        if targets.dim() == 2:
+            s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
+            weight = None if weight is None else weight.reshape(-1)
+        errors = self._descent.step(s, a, targets, weight)
+        self._count()
+        return Update(errors, targets)
+
+    def _arrays_of(self, transition: Transition) -> tuple[_Array, ...] | None:
+        """Observation, action, reward, discount and successor as arrays, where the quick way applies.
+
+        A replay buffer hands out the same tensors every time, so their arrays are made once.
+        """
+        if transition is not self._seen:
+            self._seen, self._seen_arrays = transition, None
+            t, dtype = transition, self.engine.flat.values.dtype
+            plain = self._descent.on_arrays is not None and self.settings.target_rule == "q_learning"
+            alike = t.r_t.dtype == t.discount_t.dtype == dtype and t.r_t.shape == t.discount_t.shape == t.a_tm1.shape
+            if plain and alike and t.r_t.dim() == 1 and len(t.s_tm1) == len(t.s_t) == len(t.r_t):
+                self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))
+        return self._seen_arrays
+
+    def _update_arrays(self, arrays: tuple[_Array, ...], weight: _Array | None) -> Update:
+        """`update` by one-step Q-learning, without tensors."""
+        s_tm1, a_tm1, r_t, discount_t, s_t = arrays
+        assert self._descent.on_arrays is not None
+        q_t = self._descent.on_arrays.all_arrays(s_t, target=True)
+        targets = q_learning_array_targets(r_t, discount_t, q_t, self.reward_scale)
+        errors = self._descent.step_arrays(s_tm1, a_tm1, targets, weight)
+        self._count()
+        return Update(torch.from_numpy(errors), torch.from_numpy(targets))
+
+    def _count(self) -> None:
+        self.num_updates += 1
+        if self.num_updates % (self.settings.target_period_updates or 1) == 0:
+            self.engine.sync_target()
+
+    def begin_streams(self) -> None:
+        """Nothing connects one sample to the next."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, optimiser, target copy and counters."""
+        return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        self.num_updates = int(state["num_updates"])
+        self._descent.load_state_dict(state["descent"])

@@ -1,0 +1,1 @@
+"""Learning one step at a time with eligibility traces."""

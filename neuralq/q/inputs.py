@@ -1,0 +1,53 @@
+"""What a network does to its input first: indices become one-hot vectors, bytes brightness."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from neuralq.checks import check_whole
+
+__all__ = ["OneHot", "Pixels"]
+
+
+class OneHot(nn.Module):
+    """State indices to one-hot vectors; has no parameters.
+
+    Args:
+        num_categories: number of states, at least 1.
+        dtype: of the result.
+
+    Example:
+        >>> OneHot(3)(torch.tensor([2, 0])).tolist()
+        [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    """
+
+    def __init__(self, num_categories: int, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        check_whole("num_categories", num_categories)
+        self.num_categories = int(num_categories)
+        self.dtype = dtype
+
+    def forward(self, index: Tensor) -> Tensor:
+        """One-hot rows: ``[*n] int64 -> [*n, num_categories]``."""
+        zeros = torch.zeros(*index.shape, self.num_categories, dtype=self.dtype, device=index.device)
+        return zeros.scatter(-1, index.unsqueeze(-1), 1.0)
+
+
+class Pixels(nn.Module):
+    """Bytes to brightness in [0, 1]: ``x / 255``; has no parameters.
+
+    Example:
+        >>> Pixels()(torch.tensor([0, 255], dtype=torch.uint8)).tolist()
+        [0.0, 1.0]
+    """
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Scaled pixels: ``[*n, *obs] uint8 -> [*n, *obs] float32``.
+
+        Raises:
+            ValueError: ``image`` is not uint8 (scaling it twice would go unnoticed).
+        """
+        if image.dtype != torch.uint8:
+            raise ValueError(f"Pixels takes uint8 images, got {image.dtype}; leave Pixels out for scaled images")
+        return image.to(torch.float32) / 255

@@ -1,0 +1,1 @@
+"""Compiled passes through networks: products, batches and single rows."""

@@ -1,0 +1,78 @@
+"""Greedy evaluation: the returns of a policy without exploration, on an environment of its own.
+
+The first episode of every environment counts and no other: taking whichever episodes finish first would favour short ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from neuralq.runs.stream.acting import choose_greedy
+from neuralq.checks import check_whole
+from neuralq.runs.stream import Interaction
+
+__all__ = ["Evaluation", "evaluate_greedy"]
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Undiscounted returns and lengths of greedy episodes.
+
+    Args:
+        returns: one per episode.
+        lengths: steps of each.
+        num_cut: episodes that were stopped at ``max_steps`` although the environment had not ended them.
+    """
+
+    returns: tuple[float, ...]
+    lengths: tuple[int, ...]
+    num_cut: int
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.returns))
+
+
+def evaluate_greedy(
+    values: Callable[[Tensor], Tensor], stream: Interaction, num_episodes: int, seed: int, max_steps: int = 10_000
+) -> Evaluation:
+    """Play ``num_episodes`` greedy episodes.
+
+    Args:
+        values: observations ``[N, *obs]`` to action values ``[N, A]``.
+        stream: an interaction with an environment made for evaluation; it is reset.
+        num_episodes: how many; in rounds if there are more than environments.
+        seed: of the resets; the same seed meets the same episodes.
+        max_steps: bound on an episode where the environment has none.
+
+    Returns:
+        Returns and lengths in the order of environments.
+    """
+    check_whole("num_episodes", num_episodes)
+    returns: list[float] = []
+    lengths: list[int] = []
+    num_cut = 0
+    while len(returns) < num_episodes:
+        stream.restart(seed + len(returns))
+        wanted = min(stream.num_envs, num_episodes - len(returns))
+        first: dict[int, tuple[float, int]] = {}
+        missing = set(range(wanted))
+        for _ in range(max_steps):
+            for episode in stream.step(lambda s: choose_greedy(values(s))).episodes:
+                if episode.env_index in missing:
+                    first[episode.env_index] = (episode.episode_return, episode.length)
+                    missing.discard(episode.env_index)
+            if not missing:
+                break
+        running = stream.running_episodes()
+        num_cut += len(missing)
+        for env_index in range(wanted):
+            value, length = first.get(env_index, running[env_index])
+            returns.append(value)
+            lengths.append(length)
+    return Evaluation(tuple(returns), tuple(lengths), num_cut)

@@ -1,0 +1,399 @@
+"""The run folder: what a run was told, what it ran on and what it measured, in text files that outlive the process.
+
+    config.json     the effective configuration       run.json       seed and format; written last, so it marks a run
+    versions.json   of Python and the libraries       metrics.jsonl  one JSON object per line, flushed
+    summary.json    the final result                  checkpoints/   see `neuralq.runs.folder.checkpoint`
+    run.lock        held by the one writer            report.html    see `neuralq.runs.report`
+
+One process writes a run folder at a time, guarded by a lock that the system drops when the process dies, however it
+dies. Reading needs no lock: whole files are replaced in one step, and a half-written last line is passed over.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import re
+from collections.abc import Mapping
+from datetime import datetime
+from numbers import Integral, Real
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from neuralq.checks import check_whole
+
+__all__ = [
+    "RunFolder",
+    "RunFolderBusy",
+    "RunFolderError",
+    "default_run_path",
+    "is_run_folder",
+    "library_versions",
+    "read_config",
+    "read_metrics",
+    "read_seed",
+    "read_summary",
+    "read_versions",
+    "refuse_old_run",
+]
+
+FORMAT_NAME = "neuralq-run"
+FORMAT_VERSION = 1
+_LIBRARIES = ("torch", "numpy", "scipy", "gymnasium", "numba", "safetensors")
+
+
+class RunFolderError(RuntimeError):
+    """A folder is not what the call needs: no run where one is expected, a run where none may be, or a damaged one."""
+
+
+class RunFolderBusy(RunFolderError):
+    """Another process is writing this run folder; the message names the folder and that process."""
+
+
+class RunFolder:
+    """The one writer of a run folder; holds the folder's lock until closed.
+
+    Get one from `RunFolder.create` or `RunFolder.open`, and use it in a ``with`` statement.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "first"
+        >>> with RunFolder.create(path, config={"env": "CartPole-v1"}, seed=3) as run:
+        ...     run.append_metrics({"env_steps": 100, "loss": 0.5})
+        ...     run.append_metrics({"env_steps": 200, "loss": float("nan")})
+        >>> read_metrics(path)
+        [{'env_steps': 100, 'loss': 0.5}, {'env_steps': 200, 'loss': None}]
+    """
+
+    def __init__(self, path: Path, lock: int) -> None:
+        self.path = path
+        self._lock: int | None = lock
+
+    @classmethod
+    def create(cls, path: str | Path, *, config: Mapping[str, Any], seed: int) -> RunFolder:
+        """A new run in ``path``, which is made if missing and must not hold a run already.
+
+        Raises:
+            RunFolderError: if there is a run in ``path``.
+            RunFolderBusy: if another process is making one there at this moment.
+            ValueError: if ``config`` holds NaN or an infinity, which JSON has no word for.
+            TypeError: if ``config`` holds what JSON cannot express.
+        """
+        check_whole("seed", seed, 0)
+        document = _strict_json(dict(config), "config")
+        path = Path(path)
+        path.mkdir(parents=True, exist_ok=True)
+        run = cls(path, _lock(path))
+        try:
+            refuse_old_run(path)
+            _write_durably(path / "config.json", document)
+            _write_durably(path / "versions.json", _strict_json(library_versions(), "versions"))
+            marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seed": int(seed)}
+            _write_durably(path / "run.json", _strict_json(marker, "run"))
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """The existing run in ``path``, to go on writing it.
+
+        Raises:
+            RunFolderError: if there is no run in ``path``.
+            RunFolderBusy: if another process is writing it.
+        """
+        path = Path(path)
+        _read_marker(path)
+        run = cls(path, _lock(path))
+        try:
+            _cut_torn_line(run.metrics_path)
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    @property
+    def checkpoints_path(self) -> Path:
+        """Where `neuralq.runs.folder.checkpoint` keeps this run's checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics_path(self) -> Path:
+        """One JSON object per line."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def report_path(self) -> Path:
+        """The report of this run, once there is one."""
+        return self.path / "report.html"
+
+    def append_metrics(self, row: Mapping[str, float | int | str | None]) -> None:
+        """One line more in ``metrics.jsonl``, out of this process's hands when the call returns.
+
+        Args:
+            row: must hold ``env_steps``, a whole number. NaN and infinities, for which JSON has no word, become null.
+
+        Raises:
+            ValueError: if ``env_steps`` is missing or not a whole number.
+            TypeError: for a value that is neither a number, a string nor None.
+        """
+        self._check_open()
+        if "env_steps" not in row:
+            raise ValueError(f"a row of metrics must hold env_steps, got only {sorted(row)}")
+        check_whole("env_steps", row["env_steps"], 0)  # type: ignore[arg-type]  # it checks what it is given
+        line = json.dumps({name: _plain(value, name) for name, value in row.items()}, allow_nan=False)
+        with open(self.metrics_path, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    def truncate_metrics(self, after_env_steps: int) -> int:
+        """Drops the rows beyond ``after_env_steps``: those that the resumed run will write again.
+
+        Returns:
+            How many rows were dropped. The file is replaced in one step.
+
+        Raises:
+            RunFolderError: if a line other than the last is damaged.
+        """
+        self._check_open()
+        rows = read_metrics(self.path)
+        kept = [row for row in rows if row["env_steps"] <= after_env_steps]
+        if len(kept) < len(rows):
+            _write_durably(self.metrics_path, "".join(json.dumps(row) + "\n" for row in kept))
+        return len(rows) - len(kept)
+
+    def replace_config(self, config: Mapping[str, Any]) -> None:
+        """The effective configuration from now on (a resumed run may have a new budget), replaced in one step."""
+        self._check_open()
+        _write_durably(self.path / "config.json", _strict_json(dict(config), "config"))
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """The final result, replaced in one step; NaN and infinities become null.
+
+        Raises:
+            TypeError: for a value that JSON cannot express.
+        """
+        self._check_open()
+        _write_durably(self.path / "summary.json", _strict_json(_plain(dict(summary), "summary"), "summary"))
+
+    def close(self) -> None:
+        """Gives the lock back; closing twice is fine."""
+        if self._lock is not None:
+            os.ftruncate(self._lock, 0)
+            os.close(self._lock)
+            self._lock = None
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _check_open(self) -> None:
+        if self._lock is None:
+            raise RunFolderError(f"{self.path} was closed, and is no longer ours to write; open it again")
+
+
+def default_run_path(env_id: str, layout: str, seed: int, timestamp: datetime, root: str | Path = "runs") -> Path:
+    """``runs/<env>-<layout>-s<seed>-<timestamp>``, one plain folder name whatever the environment's id holds.
+
+    Example:
+        >>> default_run_path("my_games:neuralq/Grid-v0", "table", 3, datetime(2024, 5, 17, 9, 30)).as_posix()
+        'runs/my_games-neuralq-Grid-v0-table-s3-20240517-093000'
+    """
+    slug = re.sub(r"[^A-Za-z0-9._]+", "-", f"{env_id}-{layout}")[:120].strip(".-") or "run"
+    return Path(root) / f"{slug}-s{int(seed)}-{timestamp:%Y%m%d-%H%M%S}"
+
+
+def library_versions() -> dict[str, str]:
+    """What the run ran on: versions and platform, and nothing that names the machine or its folders.
+
+    Example:
+        >>> sorted(library_versions())[:4]
+        ['gymnasium', 'neuralq', 'numba', 'numpy']
+    """
+    versions = {"python": platform.python_version(), "neuralq": importlib.metadata.version("neuralq")}
+    for name in _LIBRARIES:
+        versions[name] = importlib.metadata.version(name)
+    return {**versions, "platform": f"{platform.system()} {platform.machine()}"}
+
+
+def is_run_folder(path: str | Path) -> bool:
+    """Whether a run was made in ``path``.
+
+    Example:
+        >>> is_run_folder("/nowhere")
+        False
+    """
+    return (Path(path) / "run.json").is_file()
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """The effective configuration of a run.
+
+    Raises:
+        RunFolderError: if there is no run in ``path``, or its file is damaged.
+    """
+    _read_marker(Path(path))
+    return _read_json(Path(path) / "config.json")
+
+
+def read_versions(path: str | Path) -> dict[str, str]:
+    """The versions that a run was started with.
+
+    Raises:
+        RunFolderError: if there is no run in ``path``, or its file is damaged.
+    """
+    _read_marker(Path(path))
+    return _read_json(Path(path) / "versions.json")
+
+
+def read_seed(path: str | Path) -> int:
+    """The seed of a run.
+
+    Raises:
+        RunFolderError: if there is no run in ``path``, or its file is damaged.
+    """
+    return int(_read_marker(Path(path))["seed"])
+
+
+def read_summary(path: str | Path) -> dict[str, Any]:
+    """The final result of a run.
+
+    Raises:
+        RunFolderError: if there is no run in ``path``, if it has not finished, or its file is damaged.
+    """
+    _read_marker(Path(path))
+    file = Path(path) / "summary.json"
+    if not file.exists():
+        raise RunFolderError(f"the run in {path} has no summary yet: finish it with `neuralq resume {path}`")
+    return _read_json(file)
+
+
+def read_metrics(path: str | Path) -> list[dict[str, Any]]:
+    """The rows of ``metrics.jsonl`` in the order written, also while the run is being written.
+
+    A last line without its end is passed over: its writer was killed, or is at it now.
+
+    Raises:
+        RunFolderError: if there is no run in ``path``, or a line other than the last is damaged.
+    """
+    _read_marker(Path(path))
+    file = Path(path) / "metrics.jsonl"
+    lines = file.read_bytes().split(b"\n")[:-1] if file.exists() else []
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            check_whole("env_steps", row["env_steps"], 0)
+        except (ValueError, TypeError, KeyError) as error:
+            raise RunFolderError(f"{file}, line {number}, is no row of metrics ({error}); delete the line") from error
+        rows.append(row)
+    return rows
+
+
+def _read_marker(path: Path) -> dict[str, Any]:
+    file = path / "run.json"
+    if not file.is_file():
+        raise RunFolderError(f"there is no neuralq run in {path}; start one with `neuralq train ENV --run-dir {path}`")
+    marker = _read_json(file)
+    if marker.get("format") != FORMAT_NAME or type(marker.get("seed")) is not int:
+        raise RunFolderError(f"{file} was not written by neuralq; choose another folder with --run-dir")
+    if not isinstance(marker.get("version"), int) or marker["version"] > FORMAT_VERSION:
+        raise RunFolderError(
+            f"{path} has format version {marker.get('version')!r}, and this neuralq reads up to {FORMAT_VERSION}; "
+            "upgrade neuralq"
+        )
+    return marker
+
+
+def refuse_old_run(path: Path) -> None:
+    """Raises `RunFolderError` if there is a run in ``path``, whole or in part."""
+    for name in ("run.json", "metrics.jsonl", "checkpoints", "summary.json"):
+        if (path / name).exists():
+            raise RunFolderError(
+                f"{path} already holds a run ({name}); continue it with `neuralq resume {path}`, "
+                "or choose another folder with --run-dir"
+            )
+
+
+def _lock(path: Path) -> int:
+    """A file descriptor that holds the exclusive lock of a run folder; the file tells others whose it is."""
+    lock = os.open(path / "run.lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "unknown"
+        os.close(lock)
+        raise RunFolderBusy(
+            f"{path} is being written by process {holder}; wait for it, stop it, or choose another folder"
+        ) from error
+    except BaseException:
+        os.close(lock)
+        raise
+    os.ftruncate(lock, 0)
+    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+    return lock
+
+
+def _cut_torn_line(path: Path) -> None:
+    """So that the next row does not continue the line that a killed writer left."""
+    if path.exists():
+        content = path.read_bytes()
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            os.truncate(path, whole)
+
+
+def _plain(value: Any, place: str) -> Any:
+    """``value`` in what JSON has words for; scalars of NumPy and 0-d tensors as numbers, the non-finite as None."""
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v, f"{place}[{k!r}]") for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v, f"{place}[{i}]") for i, v in enumerate(value)]
+    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
+        return _plain(value.item(), place)
+    if isinstance(value, Integral):
+        return int(value)
+    if isinstance(value, Real):
+        return float(value) if math.isfinite(value) else None
+    raise TypeError(f"{place} must be a number, a string or None, got {type(value).__name__}")
+
+
+def _strict_json(value: Any, name: str) -> str:
+    try:
+        return json.dumps(value, indent=2, allow_nan=False) + "\n"
+    except ValueError as error:
+        raise ValueError(f"{name} holds a number that JSON has no word for ({error}); use null instead") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} is damaged or missing: {error}") from error
+    if not isinstance(value, dict):
+        raise RunFolderError(f"{path} is damaged: it holds a {type(value).__name__}, not an object")
+    return value
+
+
+def _write_durably(path: Path, text: str) -> None:
+    """Readers see the old content or the new, also after a power cut."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with open(temporary, "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,318 @@
+"""From a configuration to the parts of a run: environments, representation, learner, feed and behaviour."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import nn
+
+from neuralq.runs.stream.acting import choose_epsilon_greedy, epsilon_greedy_policy
+from neuralq.q.inputs import OneHot, Pixels
+from neuralq.runs.stream.encoding import encoder_for
+from neuralq.runs.stream.experience import ExperienceSource, StepExperience, ReplayExperience, RolloutExperience
+from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
+from neuralq.learners import (
+    GradientSettings,
+    Learner,
+    OnlineLearner,
+    OnlineSettings,
+    ReplayLearner,
+    ReplaySettings,
+    RolloutLearner,
+    RolloutSettings,
+    StreamingLearner,
+    StreamingSettings,
+)
+from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
+from neuralq.q.engine import Engine, Loss, MlpEngine, array_values, make_engine
+from neuralq.runs.recipe.config import RunConfig
+from neuralq.runs.recipe.games import ATARI, make_single, register_games
+from neuralq.runs.recipe.gradient import gradient_learner, started_at_zero
+from neuralq.runs.recipe.replay import as_distribution, num_atoms, replay_learner
+from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
+from neuralq.rules import Linear
+from neuralq.runs.folder import is_resumable
+from neuralq.runs.loop import Plan, Session, seed_for
+from neuralq.types import QFunction, Transition
+from neuralq_envs import vector_twin
+
+__all__ = ["build_q", "build_session", "engine_name", "make_envs", "normalisation_for", "plan_of"]
+
+_NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]] = {
+    "action-input": ActionInputQ,
+    "separate": SeparateQ,
+    "action-output": ActionOutputQ,
+}
+
+
+def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> VectorEnv[Any, Any, Any]:
+    """Parallel environments: the registered vectorised implementation where there is one, else one after another.
+
+    Gymnasium's Mountain Car and Acrobot are vectorised by `neuralq_envs.classic`, which repeats them to the bit.
+    Elsewhere a single environment is stepped directly, which is quicker than a batch of one.
+
+    Args:
+        config: says which environment.
+        num_envs: how many.
+        training: whether rewards are clipped, and lives counted for episodes, where the configuration wants that.
+
+    Raises:
+        ValueError: if the environment is not registered or cannot be made, with what to do about it.
+    """
+    module, _, env_id = config.env.rpartition(":")
+    register_games(env_id)
+    try:
+        if module:  # registers the environment
+            importlib.import_module(module)
+        spec = gym.spec(env_id)
+        twin = vector_twin(spec, config.env_kwargs)
+        if twin is not None:
+            return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
+        if num_envs > 1 and spec.vector_entry_point is not None and not env_id.startswith(ATARI):
+            return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
+        clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
+        return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
+    except gym.error.Error as error:
+        raise ValueError(
+            f"cannot make the environment {config.env!r}: {str(error).rstrip('.')}. Name a registered Gymnasium id; an "
+            "environment of your own is found as 'your_module:YourEnv-v0'"
+        ) from error
+    except Exception as error:  # the environment's own code ran
+        raise ValueError(f"cannot make the environment {config.env!r}: {type(error).__name__}: {error}") from error
+
+
+def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:
+    """The representation for an environment's observations.
+
+    Args:
+        config: says which layout and body.
+        spec: shape and kind of the observations.
+        rng: draws the initial weights of networks.
+
+    Raises:
+        ValueError: where layout and observations do not go together.
+    """
+    q: QFunction
+    shape, num_categories = spec.inner_shape, spec.num_categories
+    features: nn.Module | None = None
+    num_outputs = spec.num_actions * num_atoms(config)
+    if config.layout == "table":
+        if num_categories is None:
+            raise ValueError("a table needs finitely many states; choose another layout")
+        q = as_distribution(config, TableQ(num_categories, num_outputs))
+        return MaskedQ(q, shape) if spec.masked else q
+    if num_categories is not None:
+        features, shape = OneHot(num_categories), (num_categories,)
+    elif spec.dtype == np.uint8:
+        features = Pixels()
+    if config.layout == "linear":
+        flat = features
+        if len(shape) > 1:
+            flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape)))
+        # One-hot features already span the constant; a bias would make the weights redundant.
+        q = LinearQ(int(np.prod(shape)), num_outputs, bias=num_categories is None, features=flat)
+    else:
+        body = config.body or body_for(shape, is_frame=spec.dtype.kind in "bu")
+        if config.dueling:
+            q = DuelingQ(shape, spec.num_actions, body, features, rng, num_atoms=num_atoms(config))
+        else:
+            q = _NETWORKS[config.layout](shape, num_outputs, body, features, rng)
+    q = as_distribution(config, q)
+    return MaskedQ(q, spec.inner_shape) if spec.masked else q
+
+
+def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Normalisation | None:
+    """The statistics through which the configured learner sees a stream; None for those that see it as it is.
+
+    Raises:
+        ValueError: where state indices would have to be normalised.
+    """
+    settings = config.settings
+    if not isinstance(settings, StreamingSettings | GradientSettings | RolloutSettings):
+        return None
+    if isinstance(settings, RolloutSettings) and not settings.normalise_observations:
+        return None
+    encoder = encoder_for(envs.single_observation_space, as_index=config.layout == "table")
+    is_index = encoder.num_categories is not None
+    if is_index and settings.normalise_observations:
+        raise ValueError("state indices have no mean to subtract; leave normalise_observations out")
+    observations = not is_index if settings.normalise_observations is None else settings.normalise_observations
+    rewards = not isinstance(settings, RolloutSettings) and settings.scale_rewards
+    if not observations and not rewards:
+        return None
+    num_envs = getattr(settings, "num_envs", 1)  # as in training, also where one environment is made to play
+    return Normalisation(encoder.shape, config.gamma, num_envs, observations, rewards)
+
+
+def build_session(config: RunConfig) -> Session:
+    """Everything that trains, freshly made from the configuration's seed, with compiled kernels warm.
+
+    Raises:
+        ValueError: for environments and combinations that cannot be learned, with the way out.
+    """
+    _check_device(config.device)
+    settings = config.settings
+    num_envs = getattr(settings, "num_envs", 1)
+    envs = make_envs(config, num_envs, training=True)
+    as_index = config.layout == "table"
+    normalisation = normalisation_for(config, envs)
+    stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
+    generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
+    q = build_q(config, stream.spec, np.random.default_rng(seed_for(config.seed, 3)))
+    if isinstance(q, nn.Module):
+        q.to(config.device)
+    loss = Loss("huber" if isinstance(settings, ReplaySettings) and settings.loss == "huber" else "squared")
+    engine = make_engine(q, loss, config.engine)
+    learner = _learner(config, engine, stream.spec, generators["samples"])
+    experience = _experience(config, stream.spec, num_envs, generators["samples"])
+    epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
+    values = learner.values if isinstance(learner, StreamingLearner) else engine.all
+    arrays = None if isinstance(learner, StreamingLearner) else array_values(engine)
+    policy = epsilon_greedy_policy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
+    evaluation_envs = make_envs(config, config.evaluation_episodes)
+    frozen = None if normalisation is None else normalisation.frozen()
+    evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index, frozen)
+    probe = is_resumable(
+        lambda: make_envs(config, num_envs, training=True),
+        seed_for(config.seed, 5),
+        np.random.default_rng(seed_for(config.seed, 6)),
+    )
+    _warm(engine, stream, settings)
+    if isinstance(settings, StreamingSettings):
+        _warm_streaming(config, engine, stream)
+    return Session(stream, policy, experience, learner, generators, evaluation, probe)
+
+
+def engine_name(learner: Learner) -> str:
+    """What computes for a learner: "compiled" kernels, "torch", or "compiled and torch", each what it can.
+
+    Kernels know tables, linear functions and convolutions only in part; where they know nothing torch steps in, and a
+    run should be able to say so.
+    """
+    if isinstance(learner, StreamingLearner):
+        return learner.engine_name
+    if not isinstance(learner.engine, MlpEngine):
+        return "torch"
+    return "compiled" if isinstance(learner, RolloutLearner | ReplayLearner | OnlineLearner) else "compiled and torch"
+
+
+def _check_device(device: str) -> None:
+    try:
+        usable = torch.zeros(1, device=device).add(1).item() == 1  # a device may be known and still not there
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().split("\n")[0]
+        raise ValueError(f"cannot compute on device {device!r}: {reason}; device='cpu' always works") from error
+    if not usable:
+        raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works")
+
+
+def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.random.Generator) -> Learner:
+    settings = config.settings
+    if isinstance(settings, RolloutSettings):
+        rows = settings.num_envs * settings.num_steps
+        total = -(-(settings.anneal_env_steps or config.total_steps) // rows) if settings.anneal else None
+        return RolloutLearner(engine, settings, rng, config.reward_scale, total)
+    if isinstance(settings, ReplaySettings):
+        return replay_learner(config, engine)
+    if isinstance(settings, StreamingSettings):
+        return StreamingLearner(engine, settings, config.gamma, config.reward_scale, _kernels(config))
+    if isinstance(settings, GradientSettings):
+        head = started_at_zero(build_q(config, spec, np.random.default_rng(seed_for(config.seed, 11))))
+        if isinstance(head, nn.Module):
+            head.to(config.device)
+        return gradient_learner(engine, settings, head, config.reward_scale)
+    return OnlineLearner(engine, settings, 1, config.reward_scale)
+
+
+def _kernels(config: RunConfig) -> str:
+    return "auto" if config.engine == "compiled" else config.engine
+
+
+def _experience(config: RunConfig, spec: ObservationSpec, num_envs: int, rng: np.random.Generator) -> ExperienceSource:
+    settings = config.settings
+    if isinstance(settings, RolloutSettings):
+        return RolloutExperience(settings.num_steps, num_envs, spec)
+    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
+        return StepExperience(num_envs, spec)
+    buffer = _buffer(settings, spec, settings.capacity)
+    return ReplayExperience(
+        buffer, rng, settings.batch_size, settings.block_length, settings.learning_starts, settings.train_period,
+        settings.updates_per_period,
+    )  # fmt: skip
+
+
+def _buffer(settings: ReplaySettings, spec: ObservationSpec, capacity: int) -> ReplayBuffer:
+    return ReplayBuffer(
+        capacity, spec.shape, spec.dtype, num_envs=settings.num_envs, num_steps=settings.num_steps,
+        prioritised=Prioritised() if settings.prioritised else None,
+    )  # fmt: skip
+
+
+def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
+    """Compile, or load from the cache, every kernel the run will call, so that its clock measures training."""
+    s = torch.from_numpy(stream.state_dict()["s"])
+    q = engine.all(s)
+    a, _ = choose_epsilon_greedy(q, 0.5, np.full(len(s), 0.5))
+    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
+        return
+    engine.loss_gradient(s, a.to(q.device), torch.zeros(len(s), dtype=q.dtype, device=q.device))
+    engine.flat.grad.zero_()
+    throwaway = torch.ones(2, dtype=q.dtype, device=q.device)
+    assert isinstance(settings, RolloutSettings | ReplaySettings)
+    FlatOptimiser(Optimiser(settings.optimiser), throwaway).step(throwaway.clone(), 0.0)
+    clip_norm_(throwaway, 0.5)
+    if isinstance(settings, ReplaySettings):
+        _warm_buffer(_buffer(settings, stream.spec, 8 * settings.num_envs), stream, settings)
+
+
+def _warm_streaming(config: RunConfig, engine: Engine, stream: Interaction) -> None:
+    """A step of a learner that is thrown away."""
+    s = torch.from_numpy(stream.state_dict()["s"]).to(config.device)
+    a, one = torch.zeros(1, dtype=torch.int64, device=config.device), torch.ones(1, device=config.device)
+    twin = make_engine(copy.deepcopy(engine.q), Loss("squared"), config.engine)
+    learner = StreamingLearner(twin, config.settings, config.gamma, 1.0, _kernels(config))  # type: ignore[arg-type]
+    learner.values(s)
+    learner.update(Transition(s, a, one, one, one, s, one > 0))
+    if stream.normalisation is not None:
+        same = Normalisation((2,), 0.5, 1)
+        same.reward(np.ones(1), np.zeros(1, bool), np.ones(1, bool))
+
+
+def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: ReplaySettings) -> None:
+    s = stream.state_dict()["s"]
+    rng = np.random.default_rng(0)
+    env_indices = range(settings.num_envs)
+    one = np.ones(len(s), np.float32)
+    fields: tuple[Any, ...] = (s, np.zeros(len(s), np.int64), one, one, one, s, np.zeros(len(s), bool))
+    for _ in range(4):
+        if len(s) == 1:
+            buffer.add_step(0, s[0], 0, 1.0, 1.0, 1.0, s[0], False)
+        else:
+            buffer.add(Transition(*(torch.from_numpy(x) for x in fields)), np.array(env_indices, np.int64))
+    if settings.block_length > 1:
+        buffer.sample_blocks(1, 2, rng)
+    else:
+        batch = buffer.sample(2, rng)
+        if settings.prioritised:
+            buffer.update_priorities(batch.indices, np.ones(2))
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """When this run evaluates, saves and stops."""
+    return Plan(
+        total_steps=config.total_steps,
+        stop_at_return=config.stop_at_return,
+        evaluate_every=config.evaluate_every,
+        evaluation_episodes=config.evaluation_episodes,
+        evaluation_max_steps=config.evaluation_max_steps,
+        checkpoint_every=config.checkpoint_every,
+        log_every=config.log_every,
+        seed=config.seed,
+    )

@@ -1,0 +1,286 @@
+"""The configuration of a run: one frozen dataclass that refuses contradictions and is stored beside the results."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from numbers import Real
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
+from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+from neuralq.q import MLP, NAMED_BODIES, Body, Conv, Custom
+from neuralq.runs.recipe.games import is_screen
+
+__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict"]
+
+LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
+Settings = RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings | GradientSettings
+LEARNERS: dict[str, type[Settings]] = {
+    "rollout": RolloutSettings,
+    "replay": ReplaySettings,
+    "online": OnlineSettings,
+    "streaming": StreamingSettings,
+    "gradient": GradientSettings,
+}
+NETWORKS = ("action-input", "separate", "action-output")
+BODIES: dict[str, type[MLP] | type[Conv] | type[Custom]] = {"MLP": MLP, "Conv": Conv, "Custom": Custom}
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run.
+
+    Args:
+        env: Gymnasium id, or "module:id" to import a module that registers it.
+        env_kwargs: passed to `gymnasium.make`.
+        clip_rewards: whether training sees rewards clipped to between −1 and 1 (Mnih et al., 2015); Atari screens only.
+        end_on_life_loss: whether in training a lost life ends the game and begins another; Atari screens only.
+        learner: "rollout", "replay", "online", "streaming" or "gradient".
+        layout: "table", "linear", "action-input", "separate" or "action-output".
+        seed: from which every generator is derived.
+        total_steps: environment steps, summed over parallel environments.
+        stop_at_return: stop once a greedy evaluation averages at least this.
+        gamma: discount γ.
+        reward_scale: rewards are multiplied by it for learning; reported returns and values are not.
+        epsilon_start: exploration at the first step.
+        epsilon_end: exploration after ``epsilon_decay_steps``, reached linearly.
+        epsilon_decay_steps: environment steps.
+        body: network body, MLP, Conv or Custom (a module of your own); networks only. None picks MLP, or Conv for
+            images.
+        dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
+        rollout: settings of the rollout learner; only with ``learner="rollout"``.
+        replay: settings of the replay learner; only with ``learner="replay"``.
+        online: settings of the online learner; only with ``learner="online"``.
+        streaming: settings of the streaming learner; only with ``learner="streaming"``.
+        gradient: settings of the gradient-TD learner; only with ``learner="gradient"``.
+        evaluate_every: environment steps between greedy evaluations.
+        evaluation_episodes: episodes of each evaluation.
+        evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
+        checkpoint_every: environment steps between checkpoints.
+        log_every: environment steps between rows of training metrics.
+        engine: "auto", "torch" or "compiled".
+        device: "cpu", "cuda", "cuda:1", ….
+        threads: CPU threads for linear algebra; small networks are fastest on one.
+    """
+
+    env: str = "CartPole-v1"
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    clip_rewards: bool = False
+    end_on_life_loss: bool = False
+    learner: str = "rollout"
+    layout: str = "action-output"
+    seed: int = 0
+    total_steps: int = 100_000
+    stop_at_return: float | None = None
+    gamma: float = 0.99
+    reward_scale: float = 1.0
+    epsilon_start: float = 1.0
+    epsilon_end: float = 0.05
+    epsilon_decay_steps: int = 20_000
+    body: MLP | Conv | Custom | None = None
+    dueling: bool = False
+    rollout: RolloutSettings | None = None
+    replay: ReplaySettings | None = None
+    online: OnlineSettings | None = None
+    streaming: StreamingSettings | None = None
+    gradient: GradientSettings | None = None
+    evaluate_every: int = 4096
+    evaluation_episodes: int = 20
+    evaluation_max_steps: int = 10_000
+    checkpoint_every: int = 50_000
+    log_every: int = 1024
+    engine: str = "auto"
+    device: str = "cpu"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse values outside their range and settings that would be ignored; fill in the learner's defaults."""
+        for name, value in _fitted(
+            "", {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}, RunConfig
+        ).items():
+            object.__setattr__(self, name, value)
+        check_choice("learner", self.learner, LEARNERS)
+        check_choice("layout", self.layout, LAYOUTS)
+        check_choice("engine", self.engine, ("auto", "torch", "compiled"))
+        check_discount("gamma", self.gamma)
+        check_positive("reward_scale", self.reward_scale)
+        check_fraction("epsilon_start", self.epsilon_start)
+        check_fraction("epsilon_end", self.epsilon_end)
+        check_whole("seed", self.seed, 0)
+        for name in (
+            "total_steps",
+            "evaluate_every",
+            "evaluation_episodes",
+            "evaluation_max_steps",
+            "checkpoint_every",
+            "log_every",
+            "threads",
+            "epsilon_decay_steps",
+        ):
+            check_whole(name, getattr(self, name))
+        for name, settings in LEARNERS.items():
+            given = getattr(self, name)
+            if name == self.learner and given is None:
+                object.__setattr__(self, name, settings())
+            elif name != self.learner and given is not None:
+                raise ValueError(
+                    f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
+                    f"use learner={name!r} or leave them out"
+                )
+        _check_body(self)
+        _check_outputs(self)
+        _check_game(self)
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the learner that runs."""
+        chosen: Settings = getattr(self, self.learner)
+        return chosen
+
+
+def _check_body(config: RunConfig) -> None:
+    """Networks have bodies, and kernels know some of them."""
+    if config.body is not None and config.layout not in NETWORKS:
+        what = "table" if config.layout == "table" else "linear function"
+        raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
+    if config.engine == "compiled" and (config.layout not in NETWORKS or isinstance(config.body, Conv | Custom)):
+        raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+    if config.engine == "compiled" and config.learner == "gradient":
+        raise ValueError(
+            "engine='compiled' has no kernels for gradient TD, whose steps need three gradients; use engine='auto'"
+        )
+
+
+def _check_outputs(config: RunConfig) -> None:
+    """Dueling streams and distributions are made of several outputs, which not every layout has."""
+    distribution = "none" if config.replay is None else config.replay.distribution
+    if config.dueling and config.layout != "action-output":
+        why = {
+            "action-input": "an action-input network sees one action at a time and has no average over them",
+            "separate": "separate networks share nothing that a common value could be learned from",
+        }.get(config.layout, f"in a {config.layout} function a value stream adds nothing to the action values")
+        raise ValueError(f"dueling needs layout='action-output', got {config.layout!r}: {why}")
+    if config.dueling and config.body is not None and not config.body.hidden:
+        raise ValueError("dueling streams need a hidden layer, got a body with hidden=(); give it a width")
+    if distribution != "none" and config.layout in ("action-input", "separate"):
+        raise ValueError(
+            f"distribution={distribution!r} needs several outputs per action, and {config.layout} networks have one "
+            "output each; use layout='action-output', 'linear' or 'table'"
+        )
+    if config.layout == "action-input" and isinstance(config.body, Custom) and not config.body.hidden:
+        raise ValueError(
+            "without a layer after it the action would be added to what the body says of the state, and one action be "
+            "best everywhere; give the body hidden=(width,), or use another layout"
+        )
+    if config.dueling and config.replay is not None and config.replay.target_rule == "dqrc":
+        raise ValueError(
+            "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
+            "leave dueling out"
+        )
+    if config.engine == "compiled" and (config.dueling or distribution != "none"):
+        raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
+
+
+def _check_game(config: RunConfig) -> None:
+    for name, way_out in (("clip_rewards", "use reward_scale"), ("end_on_life_loss", "leave it out")):
+        if getattr(config, name) and not is_screen(config.env, config.env_kwargs):
+            raise ValueError(f"{name} is for the screens of Atari games (ALE/...), got {config.env!r}; {way_out}")
+
+
+def body_to_dict(body: Body) -> dict[str, Any]:
+    """A body as configurations write it: its class and its settings.
+
+    Example:
+        >>> body_to_dict(MLP((8,)))["class"]
+        'MLP'
+    """
+    return {"class": type(body).__name__, **dataclasses.asdict(body)}
+
+
+def config_to_dict(config: RunConfig) -> dict[str, Any]:
+    """Plain values, for JSON; the body is named by its class.
+
+    Example:
+        >>> config_to_dict(RunConfig(seed=3))["rollout"]["returns"]
+        'peng'
+    """
+    plain = dataclasses.asdict(config)
+    if config.body is not None:
+        plain["body"] = body_to_dict(config.body)
+    return {name: value for name, value in plain.items() if name not in LEARNERS or name == config.learner}
+
+
+def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
+    """The configuration that `config_to_dict` wrote.
+
+    Raises:
+        ValueError: for keys that this version does not know, values of the wrong kind and contradictions.
+
+    Example:
+        >>> config_from_dict(config_to_dict(RunConfig(seed=3))) == RunConfig(seed=3)
+        True
+    """
+    values = dict(plain)
+    if values.get("kind") == "td-gammon":
+        raise ValueError("this is the configuration of a TD-Gammon run; neuralq.systems.backgammon.config reads those")
+    _refuse_unknown("the configuration", values, RunConfig)
+    for name, settings in LEARNERS.items():
+        if values.get(name) is not None:
+            values[name] = settings(**_fitted(name, values[name], settings))
+    if values.get("body") is not None:
+        body = _body_of(values["body"])
+        check_choice("class of the body", body.get("class"), BODIES)
+        kind = BODIES[body.pop("class")]
+        values["body"] = kind(**_fitted("body", body, kind))
+    return RunConfig(**values)
+
+
+def _body_of(given: Any) -> dict[str, Any]:
+    """A body as a mapping, by whatever it was named."""
+    if isinstance(given, str) and given in NAMED_BODIES:
+        return body_to_dict(NAMED_BODIES[given])
+    if isinstance(given, str) and ":" in given:
+        return {"class": "Custom", "module": given}
+    if not isinstance(given, Mapping):
+        known = ", ".join(NAMED_BODIES)
+        raise ValueError(
+            f"body must be a mapping with a class, one of {known}, or 'module:Class' of your own, got {given!r}"
+        )
+    return dict(given)
+
+
+def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:
+    """``given`` with every value of the kind that its field has in the dataclass ``known``."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{place} must be a mapping, got {given!r}")
+    _refuse_unknown(place, given, known)
+    hints = get_type_hints(known)
+    return {name: _fit(f"{place}.{name}".lstrip("."), value, hints[name]) for name, value in given.items()}
+
+
+def _fit(name: str, value: Any, hint: Any) -> Any:
+    kinds = [get_origin(kind) or kind for kind in (get_args(hint) if isinstance(hint, UnionType) else (hint,))]
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    for kind in kinds:
+        if kind is float and is_number:
+            return float(value)
+        if kind is int and is_number and float(value).is_integer():
+            return int(value)
+        if kind is tuple and isinstance(value, list | tuple):
+            return tuple(_fit(f"{name}[{i}]", entry, get_args(hint)[0]) for i, entry in enumerate(value))
+        if kind not in (int, float, tuple) and isinstance(value, kind):
+            return value
+    words = [_WORDS.get(kind, f"a {kind.__name__}") for kind in kinds if kind is not NoneType]
+    words = ["a list" if word == "a tuple" else word for word in words]
+    raise ValueError(f"{name} must be {' or '.join(words)}, got {value!r}")
+
+
+def _refuse_unknown(where: str, given: Mapping[str, Any], known: type) -> None:
+    names = {f.name for f in dataclasses.fields(known)}
+    unknown = sorted(set(given) - names)
+    if unknown:
+        raise ValueError(f"{where} has unknown keys {', '.join(unknown)}; known are {', '.join(sorted(names))}")

@@ -1,0 +1,231 @@
+"""Settings known to work, by environment and learner. A preset gives defaults; whatever is set explicitly wins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from neuralq.q.bodies import NAMED_BODIES
+from neuralq.runs.recipe.budget import cut_to_budget
+from neuralq.runs.recipe.config import NETWORKS, RunConfig, body_to_dict, config_from_dict
+
+__all__ = ["PRESETS", "preset_for", "with_preset"]
+
+_GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
+_MINATAR: dict[str, Any] = {
+    "total_steps": 5_000_000,
+    "evaluate_every": 250_000,
+    "checkpoint_every": 500_000,
+    "log_every": 20_000,
+}
+
+PRESETS: dict[tuple[str, str], dict[str, Any]] = {
+    # PQN (Gallici et al., 2024) scaled down. What matters (docs/performance.md): many small gradient steps per rollout,
+    # λ-returns refreshed between passes so that values arrive at their height, 1/(1 − γ), within 12,000 steps, a rate
+    # that falls once they have, no target network, and rewards scaled so that values stay within tens.
+    ("CartPole-v1", "rollout"): {
+        "reward_scale": 0.1,
+        "epsilon_start": 0.5,
+        "epsilon_end": 0.1,
+        "epsilon_decay_steps": 8_000,
+        "body": {"class": "MLP", "hidden": [64, 64], "layer_norm": True},
+        "rollout": {
+            "lambda_": 0.9,
+            "learning_rate": 7e-4,
+            "num_envs": 16,
+            "num_steps": 32,
+            "num_epochs": 12,
+            "num_minibatches": 8,
+            "anneal": True,
+            "anneal_env_steps": 16_000,
+            "anneal_to": 0.1,
+            "refresh_targets": True,
+            "average_updates": 8.0,
+        },
+    },
+    # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves: ε may fall soon.
+    # Long rollouts and wide layers keep policies from forgetting the few starts that take long (docs/benchmarks.md).
+    ("Acrobot-v1", "rollout"): {
+        "total_steps": 200_000,
+        "gamma": 0.995,
+        "reward_scale": 0.1,
+        "epsilon_end": 0.01,
+        "epsilon_decay_steps": 20_000,
+        "evaluate_every": 10_000,
+        "body": {"class": "MLP", "hidden": [256, 256], "layer_norm": True},
+        "rollout": {
+            "lambda_": 0.6,
+            "learning_rate": 5e-4,
+            "num_envs": 16,
+            "num_steps": 128,
+            "num_epochs": 8,
+            "num_minibatches": 32,
+            "anneal": True,
+            "normalise_observations": True,
+            "refresh_targets": True,
+            "average_updates": 8.0,
+        },
+    },
+    # As Acrobot. The velocity is a twentieth of the position's size, and as important.
+    ("MountainCar-v0", "rollout"): {
+        "total_steps": 300_000,
+        "gamma": 0.995,
+        "reward_scale": 0.1,
+        "epsilon_end": 0.01,
+        "epsilon_decay_steps": 150_000,
+        "evaluate_every": 15_000,
+        "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
+        "rollout": {
+            "lambda_": 0.8,
+            "learning_rate": 1e-3,
+            "num_envs": 16,
+            "num_steps": 32,
+            "num_epochs": 8,
+            "num_minibatches": 16,
+            "anneal": True,
+            "normalise_observations": True,
+            "average_updates": 16.0,
+        },
+    },
+    # As CartPole: refreshed targets, and an average that plays. Observations are of similar size as they come, and the
+    # rewards of ±100 at the end become ±10.
+    ("LunarLander-v3", "rollout"): {
+        "total_steps": 500_000,
+        "gamma": 0.99,
+        "reward_scale": 0.1,
+        "epsilon_end": 0.02,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 25_000,
+        "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": True},
+        "rollout": {
+            "lambda_": 0.9,
+            "learning_rate": 5e-4,
+            "num_envs": 16,
+            "num_steps": 32,
+            "num_epochs": 8,
+            "num_minibatches": 8,
+            "anneal": True,
+            "refresh_targets": True,
+            "average_updates": 32.0,
+        },
+    },
+    # Plain gradient steps without replay or step bounds need small values and normalised layers to stay finite.
+    ("CartPole-v1", "online"): {
+        "reward_scale": 0.1,
+        "body": {"class": "MLP", "hidden": [64, 64], "layer_norm": True},
+        "online": {"lambda_": 0.8, "step_size": 1e-3},
+    },
+    # Stream Q(λ) as published for classic control (Elsayed, Vasan & Mahmood 2024): α = 1, κ = 2, λ = 0.8, γ = 0.99,
+    # ε from 1 to 0.01 over 5 % of 500,000 steps, 32-32 units normalised without a scale of their own, nine weights in
+    # ten at 0. The cut is the exact one; --streaming.cut published gives theirs.
+    **{
+        (env, "streaming"): {
+            "total_steps": 500_000,
+            "epsilon_end": 0.01,
+            "epsilon_decay_steps": 25_000,
+            "evaluate_every": 25_000,
+            "log_every": 5_000,
+            "body": {
+                "class": "MLP",
+                "hidden": [32, 32],
+                "layer_norm": True,
+                "affine": False,
+                "activation": "leaky_relu",
+                "sparsity": 0.9,
+            },
+        }
+        for env in ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")
+    },
+    # PQN (Gallici et al., 2024) on MinAtar; published over 10,000,000 steps, ε over the first tenth of them as here.
+    **{
+        (f"MinAtar/{game}-v1", "rollout"): {
+            **_MINATAR,
+            "epsilon_decay_steps": 500_000,
+            "body": body_to_dict(NAMED_BODIES["minatar"]),
+            "rollout": {
+                "lambda_": 0.65,
+                "num_envs": 128,
+                "num_steps": 32,
+                "num_epochs": 2,
+                "num_minibatches": 32,
+                "learning_rate": 5e-4,
+                "anneal": True,
+            },
+        }
+        for game in _GAMES
+    },
+    # Stream Q(λ) on MinAtar, as above but for the network and ε over the first fifth of 5,000,000 steps to 0.01; QRC(λ)
+    # (Elelimy et al. 2025) as published, on the same network, with the defaults of `GradientSettings`.
+    **{
+        (f"MinAtar/{game}-v1", learner): {
+            **_MINATAR,
+            "epsilon_end": 0.01,
+            "epsilon_decay_steps": 1_000_000,
+            "body": {
+                **body_to_dict(NAMED_BODIES["minatar"]),
+                "init": "uniform",
+                "affine": False,
+                "activation": "leaky_relu",
+                "sparsity": 0.9,
+            },
+        }
+        for game in _GAMES
+        for learner in ("streaming", "gradient")
+    },
+    # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
+    # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
+    ("neuralq/MitchellGrid-v0", "rollout"): {
+        "total_steps": 16_000,
+        "gamma": 0.9,
+        "reward_scale": 0.01,
+        "epsilon_start": 1.0,
+        "epsilon_end": 1.0,
+        "evaluate_every": 16_000,
+        "rollout": {
+            "lambda_": 0.0,
+            "num_envs": 16,
+            "num_steps": 8,
+            "num_epochs": 8,
+            "num_minibatches": 1,
+            "optimiser": "sgd",
+            "learning_rate": 0.5,
+        },
+    },
+}
+
+
+def preset_for(env: str, learner: str) -> dict[str, Any]:
+    """The preset's values, empty where there is none.
+
+    Example:
+        >>> preset_for("CartPole-v1", "rollout")["reward_scale"]
+        0.1
+        >>> preset_for("Unknown-v0", "rollout")
+        {}
+    """
+    return PRESETS.get((env, learner), {})
+
+
+def with_preset(plain: Mapping[str, Any]) -> RunConfig:
+    """The configuration of what is given, over the preset of its environment and learner, over the defaults.
+
+    Schedules that are not given end within a ``total_steps`` that is (`neuralq.runs.recipe.budget`).
+
+    Args:
+        plain: as `config_to_dict` writes it, or any part of that; settings of the learner may be partial too.
+
+    Raises:
+        ValueError: for unknown keys and values out of range, as `RunConfig` does.
+
+    Example:
+        >>> config = with_preset({"env": "CartPole-v1", "rollout": {"num_envs": 8}})
+        >>> config.rollout.num_envs, config.reward_scale
+        (8, 0.1)
+    """
+    learner = plain.get("learner", RunConfig.learner)
+    preset = preset_for(plain.get("env", RunConfig.env), learner)
+    if plain.get("layout", RunConfig.layout) not in NETWORKS:
+        preset = {name: value for name, value in preset.items() if name != "body"}
+    preset, _ = cut_to_budget(preset, plain)
+    settings = {learner: {**preset.get(learner, {}), **(plain.get(learner) or {})}}
+    return config_from_dict({**preset, **plain, **settings})

@@ -1,0 +1,28 @@
+"""Reports: one self-contained HTML page per run, readable on a phone, printable, free of scripts and outside resources.
+
+Drawing needs the extra ``plot`` (matplotlib), which is imported when the first figure is drawn.
+"""
+
+from __future__ import annotations
+
+from neuralq.runs.report.curves import learning_curve_svg, signals_svg
+from neuralq.runs.report.demo import write_demo_report
+from neuralq.runs.report.divergence import DivergenceResult, divergence_svg, growth_table, values_table
+from neuralq.runs.report.page import Page
+from neuralq.runs.report.readings import read_metrics
+from neuralq.runs.report.run import write_report
+from neuralq.checks import MissingExtra
+
+__all__ = [
+    "DivergenceResult",
+    "MissingExtra",
+    "Page",
+    "divergence_svg",
+    "growth_table",
+    "learning_curve_svg",
+    "read_metrics",
+    "signals_svg",
+    "values_table",
+    "write_demo_report",
+    "write_report",
+]

@@ -1,0 +1,117 @@
+"""The page of one run, from what its folder holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neuralq.runs.report.curves import SIGNALS, learning_curve_svg, signals_svg
+from neuralq.runs.report.page import Page, facts_table, flatten
+from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite, read_json, read_metrics
+
+__all__ = ["write_report"]
+
+_FILES = ("metrics.jsonl", "config.json", "versions.json", "summary.json")
+_TARGET_KEYS = ("stop_at_return", "target_return")
+_NAME_KEYS = ("env_id", "environment", "env")
+
+
+def write_report(run_dir: str | Path) -> Path:
+    """Writes ``report.html`` into a run folder and returns its path; may be called while the run goes on.
+
+    Reads ``metrics.jsonl``, ``config.json``, ``versions.json`` and ``summary.json``; each may still be missing.
+
+    Raises:
+        FileNotFoundError: the folder holds none of them.
+        ValueError: one of them is damaged; names it.
+        MissingExtra: matplotlib is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> _ = (folder / "metrics.jsonl").write_text('{"kind": "train", "env_steps": 64, "episode_return": 9.5}')
+        >>> write_report(folder).name
+        'report.html'
+    """
+    folder = Path(run_dir)
+    if not any((folder / file).exists() for file in _FILES):
+        raise FileNotFoundError(f"{folder} is no run folder: it holds none of {', '.join(_FILES)}; pass one that does")
+    rows = read_metrics(folder / "metrics.jsonl")
+    config, versions, summary = (read_json(folder / f"{file}.json") for file in ("config", "versions", "summary"))
+    target = _first_number(config, _TARGET_KEYS)
+    page = Page(_title(config, folder), lead=_lead(rows, target))
+    page.heading("Result")
+    page.table(facts_table(_facts(rows, summary)))
+    for column, label in SIGNALS.items():
+        step = first_not_finite(rows, "train", column)
+        if step is not None:
+            page.paragraph(
+                f"At {step:,} environment steps the {label} was not a finite number: learning had diverged. "
+                "The signals below show how it grew before.",
+                warning=True,
+            )
+    page.heading("Learning curve")
+    page.figure(
+        learning_curve_svg(rows, target),
+        "The line of dots is the policy without exploration; the band holds the middle half of its episodes. Training "
+        "episodes still explore, so they may score lower.",
+    )
+    page.heading("Is learning sound?")
+    signals = signals_svg(rows)
+    if signals is None:
+        page.paragraph("No TD error, Q value or loss was recorded yet.")
+    else:
+        page.figure(
+            signals,
+            "δ is the TD error: how far a prediction is from its target. A largest Q that climbs past every return "
+            "that can be had, with |δ| climbing along, is divergence.",
+        )
+    page.heading("How it was made")
+    page.folded("Effective configuration", _recorded(config))
+    page.folded("Versions", _recorded(versions))
+    return page.write(folder / "report.html")
+
+
+def _recorded(facts: Mapping[str, Any]) -> str:
+    return facts_table(facts) if facts else "<p>Not recorded.</p>"
+
+
+def _first_number(facts: Mapping[str, Any], keys: Sequence[str]) -> float | None:
+    values = (as_float(value) for name, value in flatten(facts) if name.rsplit(".", 1)[-1] in keys)
+    return next((value for value in values if math.isfinite(value)), None)
+
+
+def _title(config: Mapping[str, Any], folder: Path) -> str:
+    named = {key.rsplit(".", 1)[-1]: value for key, value in flatten(config) if isinstance(value, str)}
+    name = next((named[key] for key in _NAME_KEYS if key in named), folder.resolve().name)
+    return f"{name}: what was learned"
+
+
+def _lead(rows: Sequence[Row], target: float | None) -> str:
+    steps, returns = finite_series(rows, "evaluation", "greedy_return")
+    if not len(steps):
+        return "No greedy evaluation has been recorded yet."
+    text = f"After {steps[-1]:,.0f} environment steps the greedy policy scores {returns[-1]:.4g} per episode."
+    if target is None:
+        return text
+    reached = steps[returns >= target]
+    if len(reached):
+        return f"{text} The target of {target:g} was first reached at {reached[0]:,.0f}."
+    return f"{text} The target of {target:g} was not reached."
+
+
+def _facts(rows: Sequence[Row], summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The summary of a finished run; for one still going, what its last rows say."""
+    facts = dict(summary)
+    for column in ("env_steps", "wall_seconds", "cpu_seconds", "steps_per_second"):
+        _, values = finite_series(rows, "train", column)
+        if len(values):
+            facts.setdefault(column, float(values[-1]))
+    steps, returns = finite_series(rows, "evaluation", "greedy_return")
+    if len(steps):
+        facts.setdefault("greedy_return", float(returns[-1]))
+        facts["best_greedy_return"] = float(returns.max())
+        facts["greedy_evaluations"] = len(steps)
+    return {key.replace("_", " "): value for key, value in facts.items()} or {"rows recorded": len(rows)}

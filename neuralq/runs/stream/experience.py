@@ -1,0 +1,270 @@
+"""Feeds: what stands between a stream of experience and a learner, and decides when there is something to learn from.
+
+A feed is filled with every step and asked after each whether there are samples. `RolloutExperience` hands out a rollout
+``[T, N]`` each time one is full, `ReplayExperience` draws from a replay buffer at its period, `StepExperience` passes every step
+on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq.runs.stream import ObservationSpec, Step
+from neuralq.learners.replay.buffer import ReplayBuffer
+from neuralq.types import Transition
+
+__all__ = ["Feed", "StepExperience", "ReplayExperience", "RolloutExperience", "Sample"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Something to learn from; valid until the next one.
+
+    Args:
+        transition: experience in the shape that the learner takes.
+        weight: one per row, 0 where a row is no experience; None for all ones.
+        indices: where the rows are stored, if their priorities are wanted back.
+    """
+
+    transition: Transition
+    weight: Tensor | None = None
+    indices: _Array | None = None
+
+
+class ExperienceSource(Protocol):
+    """What training asks of a feed."""
+
+    def add(self, step: Step) -> None:
+        """Take in one step of the stream."""
+        ...
+
+    def draw(self) -> Iterator[Sample]:
+        """The samples that are due now, none most of the time."""
+        ...
+
+    def return_errors(self, sample: Sample, errors: Tensor) -> None:
+        """Take back the TD errors of a sample, for its priorities."""
+        ...
+
+    @property
+    def between_samples(self) -> bool:
+        """Whether nothing is half collected: the time for checkpoints and evaluations."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a continued run needs."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        ...
+
+
+class _Rows:
+    """Preallocated fields ``[T, N]`` with a flag for the entries that hold experience.
+
+    Rewards and discounts are float64, so that tables and linear functions learn from the numbers that were meant.
+    """
+
+    def __init__(self, num_steps: int, num_envs: int, spec: ObservationSpec) -> None:
+        lead = (num_steps, num_envs)
+        self.fields: tuple[_Array, ...] = (
+            np.zeros((*lead, *spec.shape), spec.dtype),
+            np.zeros(lead, np.int64),
+            np.ones(lead, np.float32),
+            np.zeros(lead, np.float64),
+            np.zeros(lead, np.float64),
+            np.zeros((*lead, *spec.shape), spec.dtype),
+            np.ones(lead, bool),
+        )
+        self.held = np.zeros(lead, np.float32)
+        self.transition = Transition(*(torch.from_numpy(x) for x in self.fields))
+
+    def write(self, row: int, step: Step) -> None:
+        if len(step.env_indices) == self.held.shape[1]:
+            for field, value in zip(self.fields, step.rows, strict=True):
+                field[row] = value
+            self.held[row] = 1
+            return
+        # An environment that did not move: nothing may reach across it, and nobody may learn from it.
+        self.fields[4][row] = 0
+        self.fields[6][row] = True
+        self.held[row] = 0
+        for field, value in zip(self.fields, step.rows, strict=True):
+            field[row, step.env_indices] = value
+        self.held[row, step.env_indices] = 1
+
+
+class RolloutExperience:
+    """Collects T steps of N environments, hands them out once, and starts again.
+
+    Args:
+        num_steps: T.
+        num_envs: N.
+        spec: of the observations.
+    """
+
+    def __init__(self, num_steps: int, num_envs: int, spec: ObservationSpec) -> None:
+        self._rows = _Rows(num_steps, num_envs, spec)
+        self._num_steps = num_steps
+        self._at = 0
+
+    def add(self, step: Step) -> None:
+        """Write the next row."""
+        self._rows.write(self._at, step)
+        self._at += 1
+
+    def draw(self) -> Iterator[Sample]:
+        """The rollout, once it is full."""
+        if self._at == self._num_steps:
+            held = self._rows.held
+            self._at = 0  # before handing out: whoever takes one sample need not ask for another
+            yield Sample(self._rows.transition, None if held.all() else torch.from_numpy(held))
+
+    def return_errors(self, sample: Sample, errors: Tensor) -> None:
+        """Rollouts have no priorities."""
+
+    @property
+    def between_samples(self) -> bool:
+        """Whether no rollout is half collected."""
+        return self._at == 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: rollouts are kept only while they are collected, and runs stop between them."""
+        if self._at:
+            raise ValueError(
+                f"a rollout is half collected ({self._at} of {self._num_steps} rows); save between rollouts"
+            )
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Nothing to restore."""
+
+
+class ReplayExperience:
+    """Stores every step and draws batches, or blocks, at its period.
+
+    Args:
+        buffer: where steps are stored.
+        rng: draws the samples.
+        batch_size: rows per sample; with blocks, ``batch_size // block_length`` blocks.
+        block_length: 1 for independent samples ``[B]``, more for blocks ``[T, B]``.
+        learning_starts: steps stored before the first sample.
+        train_period: environment steps between samples.
+        updates_per_period: samples at each of those times.
+    """
+
+    def __init__(
+        self,
+        buffer: ReplayBuffer,
+        rng: np.random.Generator,
+        batch_size: int,
+        block_length: int,
+        learning_starts: int,
+        train_period: int,
+        updates_per_period: int,
+    ) -> None:
+        self.buffer = buffer
+        self._rng = rng
+        self._batch_size = batch_size
+        self._block_length = block_length
+        self._learning_starts = learning_starts
+        self._train_period = train_period
+        self._updates_per_period = updates_per_period
+        self._num_added = 0
+        self._due = learning_starts
+
+    def add(self, step: Step) -> None:
+        """Store one step of each environment that moved."""
+        if len(step.env_indices) == 1:
+            s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t = (row[0] for row in step.rows)
+            self.buffer.add_step(int(step.env_indices[0]), s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t)
+        else:
+            self.buffer.add(step.transition, step.env_indices)
+        self._num_added += len(step.env_indices)
+
+    def draw(self) -> Iterator[Sample]:
+        """The samples that are due."""
+        while self._num_added >= self._due:
+            self._due += self._train_period
+            for _ in range(self._updates_per_period):
+                if self._block_length > 1:
+                    blocks = self._batch_size // self._block_length
+                    yield Sample(self.buffer.sample_blocks(blocks, self._block_length, self._rng))
+                else:
+                    batch = self.buffer.sample(self._batch_size, self._rng)
+                    prioritised = self.buffer.prioritised is not None
+                    yield Sample(
+                        batch.transition,
+                        batch.weights if prioritised else None,
+                        batch.indices if prioritised else None,
+                    )
+
+    def return_errors(self, sample: Sample, errors: Tensor) -> None:
+        """New priorities |δ| where sampling is prioritised."""
+        if sample.indices is not None:
+            self.buffer.update_priorities(sample.indices, errors)
+
+    @property
+    def between_samples(self) -> bool:
+        """Always: every step is stored at once."""
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """The buffer and the counters."""
+        return {"buffer": self.buffer.state_dict(), "num_added": self._num_added, "due": self._due}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        self.buffer.load_state_dict(state["buffer"])
+        self._num_added = int(state["num_added"])
+        self._due = int(state["due"])
+
+
+class StepExperience:
+    """Hands out every step as it comes, one row per environment ``[N]``.
+
+    Args:
+        num_envs: N.
+        spec: of the observations.
+    """
+
+    def __init__(self, num_envs: int, spec: ObservationSpec) -> None:
+        self._rows = _Rows(1, num_envs, spec)
+        self._row = self._rows.transition.map(lambda x: x[0])  # views, made once: this is asked for at every step
+        self._fresh = False
+
+    def add(self, step: Step) -> None:
+        """Take in the step."""
+        self._rows.write(0, step)
+        self._fresh = True
+
+    def draw(self) -> Iterator[Sample]:
+        """The step, once; environments that did not move have weight 0."""
+        if self._fresh:
+            self._fresh = False
+            held = self._rows.held[0]
+            yield Sample(self._row, None if held.all() else torch.from_numpy(held))
+
+    def return_errors(self, sample: Sample, errors: Tensor) -> None:
+        """Steps are learned from once."""
+
+    @property
+    def between_samples(self) -> bool:
+        """Whether the last step has been handed out."""
+        return not self._fresh
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: steps are not kept."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Nothing to restore."""

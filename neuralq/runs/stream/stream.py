@@ -1,0 +1,387 @@
+"""The stream of experience: one step of a batch of environments after another, as transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from torch import Tensor
+
+from neuralq.checks import check_discount
+from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
+from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
+from neuralq.runs.stream.normalisation import Normalisation
+from neuralq.types import Transition
+
+__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
+
+_Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class Policy(Protocol):
+    """Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``.
+
+    A policy with an ``on_arrays`` that is not None is asked there, arrays in and arrays out, which spares a tensor or
+    two per step; `neuralq.runs.stream.acting.EpsilonGreedy` has one.
+    """
+
+    def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Actions and their probabilities."""
+        ...
+
+
+class EnvironmentFault(RuntimeError):
+    """An environment broke its contract; says which one, when and in which field."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationSpec:
+    """What a representation is handed.
+
+    Args:
+        shape: of one encoded observation, mask included.
+        dtype: NumPy dtype it is stored in.
+        inner_shape: shape without the action mask.
+        num_categories: number of states if the observation is a state index, else None.
+        masked: whether an action mask is appended.
+        num_actions: A.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    inner_shape: tuple[int, ...]
+    num_categories: int | None
+    masked: bool
+    num_actions: int
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A finished episode: its environment, undiscounted return and length in steps."""
+
+    env_index: int
+    episode_return: float
+    length: int
+
+
+class Step(NamedTuple):
+    """One step of a batch of environments, with one row for each environment that really moved.
+
+    Args:
+        rows: the fields of the `Transition`, in its order, as arrays ``[k, …]``. Feeds copy them; making tensors first
+            would cost as much again as the copying.
+        env_indices: which environment each row is, ``[k]``.
+        episodes: those that ended with this step.
+    """
+
+    rows: tuple[_Array, ...]
+    env_indices: _Array
+    episodes: tuple[Episode, ...]
+
+    @property
+    def transition(self) -> Transition:
+        """The same as tensors, sharing the memory of ``rows``."""
+        return Transition(*(torch.from_numpy(row) for row in self.rows))
+
+
+class Interaction:
+    """A vector environment and where it stands: the iterator's state, so that a run can stop and go on.
+
+    Args:
+        envs: Gymnasium vector environment with Discrete actions, in any autoreset mode. The sub-environments of a
+            `SyncVectorEnv` are wrapped in `SubEnv`, in place.
+        discount: γ in [0, 1].
+        seed: of the first reset; None continues the environments' own randomness.
+        as_index: encode finite observations as one index, for tables.
+        normalisation: through which observations and the rewards of transitions are seen; episode returns are not.
+
+    Raises:
+        ValueError: for spaces that cannot be learned from and environments that do not say how they restart.
+    """
+
+    def __init__(
+        self,
+        envs: VectorEnv[Any, Any, Any],
+        discount: float,
+        seed: int | None,
+        as_index: bool = False,
+        normalisation: Normalisation | None = None,
+    ) -> None:
+        check_discount("discount", discount)
+        self.envs = envs
+        self.normalisation = normalisation
+        self.num_envs: int = envs.num_envs
+        self.discount = float(discount)
+        self.encoder: Encoder = encoder_for(envs.single_observation_space, as_index=as_index)
+        self.num_actions, self._first_action = discrete_actions(envs.single_action_space)
+        self.mode = _autoreset_mode(envs)
+        inner = envs.unwrapped
+        if isinstance(inner, SyncVectorEnv):
+            inner.envs = [e if isinstance(e, SubEnv) else SubEnv(e, i) for i, e in enumerate(inner.envs)]
+        self.num_steps = 0
+        self._everyone = np.arange(self.num_envs)
+        self._discounts = np.full(self.num_envs, self.discount)
+        self._broken = False
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, np.int64)
+        self._pending = np.zeros(self.num_envs, bool)
+        self._mask: _Array | None = None
+        self._begun = False
+        self.restart(seed)
+        self._begun = True
+        self.spec = self._describe()
+
+    def _describe(self) -> ObservationSpec:
+        encoder, masked = self.encoder, self._mask is not None
+        return ObservationSpec(
+            self._s.shape[1:], self._s.dtype, encoder.shape, encoder.num_categories, masked, self.num_actions
+        )
+
+    def restart(self, seed: int | None) -> None:
+        """Reset every environment: an episode boundary in every environment.
+
+        Raises:
+            EnvironmentFault: if an environment raises, or hands out what its space did not promise.
+        """
+        try:
+            observation, info = self.envs.reset(seed=seed)
+        except Exception as error:
+            raise self._fault(f"at reset, {_describe_error(error)}") from error
+        self._pending[:] = False
+        self._returns[:] = 0
+        self._lengths[:] = 0
+        self._s = self._observe(observation, info, self._everyone)
+
+    def _observe(self, observation: Any, info: Mapping[str, Any], env_indices: _Array, over: _Array | None = None) -> _Array:
+        """Encode a batch, with the action mask of ``environments`` appended where the environment gives one.
+
+        Where ``over`` is true the world has ended, and there may be no legal action.
+        """
+        try:
+            encoded = self.encoder.encode(observation)
+        except ObservationError as error:
+            raise self._fault(str(error)) from error
+        if self.normalisation is not None:
+            encoded = self.normalisation.observe(encoded, env_indices)
+        if self._mask is None and "action_mask" in info:
+            if self._begun:
+                raise self._fault("field info['action_mask']: given now but not at the first reset; give it always")
+            self._mask = np.ones((self.num_envs, self.num_actions), bool)
+        if self._mask is None:
+            return encoded
+        self._mask[env_indices] = self._legal(info, env_indices, over)
+        return self._with_mask(encoded)
+
+    def _legal(self, info: Mapping[str, Any], env_indices: _Array, over: _Array | None) -> _Array:
+        """The masks of ``environments``, ``[k, A]`` bool; an environment without one may do everything."""
+        legal = np.ones((len(env_indices), self.num_actions), bool)
+        given, held = info.get("action_mask"), info.get("_action_mask")
+        if given is None:
+            return legal
+        rows = np.flatnonzero(np.ones(len(env_indices)) if held is None else held[env_indices])
+        found = np.asarray(given)[env_indices[rows]]
+        masks = found if found.dtype != object else [np.asarray(mask) for mask in found]
+        shapes = [found.shape[1:]] if found.dtype != object else [mask.shape for mask in masks]
+        for row, shape in zip(rows, shapes, strict=False):
+            if shape != (self.num_actions,):
+                raise self._mask_fault(env_indices[row], f"must have {self.num_actions} entries, got shape {shape}")
+        if len(rows):
+            legal[rows] = np.asarray(masks) != 0
+        for row in np.flatnonzero(~legal.any(-1)):
+            if over is None or not over[env_indices[row]]:
+                raise self._mask_fault(env_indices[row], "must allow an action until the episode has terminated, allows none")
+            legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
+        return legal
+
+    def _mask_fault(self, env_index: int, problem: str) -> EnvironmentFault:
+        step = self._lengths[env_index] + 1
+        return self._fault(f"environment {environment}, step {step} of its episode, field info['action_mask']: {problem}")
+
+    def _with_mask(self, encoded: _Array) -> _Array:
+        assert self._mask is not None
+        flat = encoded.reshape(len(encoded), -1)
+        return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
+
+    def _fault(self, what: str) -> EnvironmentFault:
+        self._broken = True
+        return EnvironmentFault(f"after {self.num_steps:,} environment steps, {what}")
+
+    def steps(self, policy: Policy) -> Iterator[Step]:
+        """Endless steps under ``policy``."""
+        while True:
+            yield self.step(policy)
+
+    def step(self, policy: Policy) -> Step:
+        """Act once in every environment.
+
+        Raises:
+            EnvironmentFault: if an environment raises, or hands out NaN or a wrong shape or dtype.
+        """
+        if self._broken:
+            raise EnvironmentFault("this interaction has ended with an error; start a new one")
+        chosen, mu = _act(policy, self._s)
+        try:
+            observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
+        except Exception as error:
+            raise self._fault(_describe_error(error)) from error
+        last = terminated | truncated
+        r_t = self._checked_reward(reward)
+        ended = np.count_nonzero(last) > 0  # four times as quick as last.any(), here at every step
+        same_step = self.mode is AutoresetMode.SAME_STEP
+        arrived = self._observe(observation, info, self._everyone, None if same_step else terminated)
+        s_t = self._true_successors(arrived, last, terminated, info) if same_step and ended else arrived
+        fake = self._pending
+        everyone = np.count_nonzero(fake) == 0
+        env_indices = self._everyone if everyone else np.flatnonzero(~fake)
+        discount_t = np.where(terminated, 0.0, self.discount) if ended else self._discounts.copy()
+        rows: tuple[_Array, ...] = (self._s, chosen, mu, r_t, discount_t, s_t, last)
+        if self.normalisation is not None:
+            rows = (*rows[:3], self.normalisation.reward(r_t, last, ~fake), *rows[4:])
+        if not everyone:
+            rows = tuple(row[env_indices] for row in rows)
+            r_t = np.where(fake, 0, r_t)
+        self.num_steps += len(env_indices)
+        self._returns += r_t
+        self._lengths += 1 if everyone else ~fake
+        episodes = self._finish(last, arrived) if ended else ()
+        if self.mode is AutoresetMode.NEXT_STEP:
+            self._pending = last
+        if not (self.mode is AutoresetMode.DISABLED and episodes):
+            self._s = arrived
+        return Step(rows, env_indices, episodes)
+
+    def _checked_reward(self, reward: Any) -> _Array:
+        try:
+            r_t = np.array(reward, np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._fault(f"field reward: must be numbers, got {reward!r}") from error
+        if r_t.shape != (self.num_envs,):
+            raise self._fault(f"field reward: must have shape ({self.num_envs},), got {r_t.shape}")
+        if np.count_nonzero(np.isfinite(r_t)) < r_t.size:
+            env_index = int(np.flatnonzero(~np.isfinite(r_t))[0])
+            raise self._fault(
+                f"environment {environment}, step {self._lengths[environment] + 1} of its episode, field reward: must be finite, "
+                f"got {r_t[environment]}"
+            )
+        return r_t
+
+    def _true_successors(self, arrived: _Array, last: _Array, terminated: _Array, info: Mapping[str, Any]) -> _Array:
+        """Under SAME_STEP, what the finished episodes really arrived at."""
+        successors = arrived.copy()
+        rows = successors.reshape(self.num_envs, -1)  # a view
+        ended = np.flatnonzero(last)
+        for env_index in ended:
+            try:
+                encoded = self.encoder.encode_single(info["final_obs"][env_index], env_index=int(env_index))
+            except ObservationError as error:
+                raise self._fault(str(error)) from error
+            if self.normalisation is not None:
+                encoded = self.normalisation.observe(np.asarray(encoded)[None])[0]
+            rows[env_index, : encoded.size] = np.reshape(encoded, -1)
+        if self._mask is not None:
+            successors[ended, -self.num_actions :] = self._legal(info.get("final_info", {}), ended, terminated)
+        return successors
+
+    def _finish(self, last: _Array, arrived: _Array) -> tuple[Episode, ...]:
+        """Account for the finished episodes and, where restarting is ours, restart those environments."""
+        ended = np.flatnonzero(last)
+        episodes = tuple(Episode(int(i), float(self._returns[i]), int(self._lengths[i])) for i in ended)
+        self._returns[ended] = 0
+        self._lengths[ended] = 0
+        if self.mode is AutoresetMode.DISABLED:
+            try:
+                observation, info = self.envs.reset(options={"reset_mask": last})
+            except Exception as error:
+                raise self._fault(_describe_error(error)) from error
+            fresh = self._observe(observation, info, ended)
+            self._s = arrived.copy()
+            self._s[ended] = fresh[ended]
+        return episodes
+
+    def running_episodes(self) -> list[tuple[float, int]]:
+        """Return so far and length of each environment's unfinished episode."""
+        return [(float(r), int(n)) for r, n in zip(self._returns, self._lengths, strict=True)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the stream stands, without the environments' own state."""
+        return {
+            "num_steps": self.num_steps,
+            "s": self._s,
+            "returns": self._returns,
+            "lengths": self._lengths,
+            "pending": self._pending,
+            "mask": self._mask,
+            "normalisation": None if self.normalisation is None else self.normalisation.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`; the environments must have been restored to the same point."""
+        self.num_steps = int(state["num_steps"])
+        self._s = np.array(state["s"])
+        self._returns = np.array(state["returns"])
+        self._lengths = np.array(state["lengths"])
+        self._pending = np.array(state["pending"])
+        self._mask = None if state["mask"] is None else np.array(state["mask"])
+        self.load_normalisation(state)
+
+    def load_normalisation(self, state: Mapping[str, Any]) -> None:
+        """Of `state_dict`, the statistics alone: they stay true where the episodes have to start anew."""
+        if self.normalisation is not None:
+            self.normalisation.load_state_dict(state["normalisation"])
+
+
+def _act(policy: Policy, s: _Array) -> tuple[_Array, _Array]:
+    on_arrays = getattr(policy, "on_arrays", None)
+    if on_arrays is not None:
+        return on_arrays(s)  # type: ignore[no-any-return]
+    action, mu = policy(torch.from_numpy(s))
+    return action.numpy(), mu.numpy()
+
+
+def _describe_error(error: Exception) -> str:
+    if isinstance(error, SubEnvFault | ObservationError):
+        return str(error)
+    return f"an environment raised {type(error).__name__}: {error}"
+
+
+def _autoreset_mode(envs: VectorEnv[Any, Any, Any]) -> AutoresetMode:
+    mode = (envs.metadata or {}).get("autoreset_mode")
+    if not isinstance(mode, AutoresetMode):
+        raise ValueError(
+            f"{type(envs).__name__} does not say how it restarts episodes: metadata['autoreset_mode'] must be a "
+            f"gymnasium.vector.AutoresetMode, got {mode!r}; without it a step that was never taken could be stored"
+        )
+    return mode
+
+
+def interact(
+    envs: VectorEnv[Any, Any, Any],
+    policy: Callable[[Tensor, np.random.Generator], tuple[Tensor, Tensor]],
+    rng: np.random.Generator,
+    discount: float = 0.99,
+) -> Iterator[Transition]:
+    """Transitions from ``envs`` under ``policy``, without end and never across an episode's end.
+
+    Args:
+        envs: Gymnasium vector environment in any autoreset mode.
+        policy: observations ``[N, *obs]`` and a generator to actions ``[N]`` and their probabilities ``[N]``.
+        rng: drawn from by the policy and for the environments' seed.
+        discount: γ.
+
+    Yields:
+        Transitions ``[k]``, one row for each environment that moved: all N, fewer while one restarts.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> envs = gym.make_vec("CartPole-v1", num_envs=2)
+        >>> push_left = lambda s, rng: (torch.zeros(len(s), dtype=torch.int64), torch.ones(len(s)))
+        >>> next(interact(envs, push_left, np.random.default_rng(0))).r_t.tolist()
+        [1.0, 1.0]
+    """
+    stream = Interaction(envs, discount, seed=int(rng.integers(2**31)))
+    for step in stream.steps(lambda s: policy(s, rng)):
+        yield step.transition

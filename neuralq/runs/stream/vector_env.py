@@ -1,0 +1,147 @@
+"""The environments of a batch, each knowing its place in it: what goes wrong in one of them is told with its index."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from neuralq.checks import check_whole
+from neuralq.runs.stream.encoding import encoder_for
+
+__all__ = ["MASK_METHODS", "Lane", "SubEnvFault", "legal_actions", "make_vector_env"]
+
+MASK_METHODS = ("action_masks", "valid_action_mask")
+"""Methods by which environments tell their legal actions, for those that do not put them into info."""
+
+
+def legal_actions(env: gym.Env[Any, Any], info: Mapping[str, Any]) -> Any:
+    """The action mask of where an environment stands: of ``info``, else by a method of its own, else None.
+
+    Args:
+        env: a single environment, wrapped or not, with one of `MASK_METHODS` or none.
+        info: of its last reset or step.
+
+    Example:
+        >>> env = gym.make("CartPole-v1")
+        >>> legal_actions(env, {}) is None, legal_actions(env, {"action_mask": [1, 0]})
+        (True, [1, 0])
+    """
+    if "action_mask" in info:
+        return info["action_mask"]
+    method = _mask_method(env)
+    return None if method is None else method()
+
+
+def _mask_method(env: gym.Env[Any, Any]) -> Callable[[], Any] | None:
+    for name in MASK_METHODS:
+        if env.has_wrapper_attr(name):
+            found: Callable[[], Any] = env.get_wrapper_attr(name)
+            if callable(found):
+                return found
+    return None
+
+
+class SubEnvFault(RuntimeError):
+    """An environment raised: carries its index so that a batch can say which."""
+
+    def __init__(self, index: int, problem: str) -> None:
+        super().__init__(f"environment {index}{problem}")
+        self.index = index
+
+
+class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
+    """One environment of a batch: its observations are copies of the promised kind, and what it raises names its index.
+
+    Copying matters under SAME_STEP: an environment that reuses its observation array would overwrite the true successor
+    with the next episode's first observation before anybody could read it. Checking matters because a batch casts what
+    it is given to the space's dtype without a word, and says nothing of the index where the shape is wrong.
+
+    Legal actions that the environment tells by a method (`MASK_METHODS`) are put into ``info["action_mask"]``.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], index: int) -> None:
+        super().__init__(env)
+        self.index = index
+        space = env.observation_space
+        self._encoder = encoder_for(space)
+        self._shape = space.shape if isinstance(space, spaces.Box) else None
+        self._dtype = space.dtype
+        self._whole = isinstance(space, spaces.Discrete)
+        self._mask_method = _mask_method(env)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As the environment's own, with a copied observation and the reward as a float."""
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        except Exception as error:
+            raise self._raised(error) from error
+        try:
+            r_t = float(reward)
+        except Exception as error:
+            raise SubEnvFault(self.index, f": reward must be a number, got {reward!r}") from error
+        return self._checked(observation), r_t, terminated, truncated, self._with_mask(info)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """As the environment's own, with a copied observation."""
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            raise self._raised(error) from error
+        return self._checked(observation), self._with_mask(info)
+
+    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
+        """What the environment says of its legal actions where ``info`` looks for it; ``info`` wins if both speak."""
+        if self._mask_method is None or "action_mask" in info:
+            return info
+        try:
+            return {**info, "action_mask": np.asarray(self._mask_method())}
+        except Exception as error:
+            raise self._raised(error) from error
+
+    def _raised(self, error: Exception) -> SubEnvFault:
+        return SubEnvFault(self.index, f" raised {type(error).__name__}: {error}")
+
+    def _checked(self, observation: Any) -> Any:
+        """A copy; the quick way first, for arrays and numbers of exactly the promised kind."""
+        if type(observation) is np.ndarray and self._shape is not None:
+            if observation.dtype != self._dtype or observation.shape != self._shape:
+                self._encoder.encode_single(observation, env_index=self.index)
+                self._dtype = observation.dtype
+            return observation.copy()
+        if not (self._whole and type(observation) in (int, np.int64)):
+            self._encoder.encode_single(observation, env_index=self.index)
+        return _copied(observation)
+
+
+def _copied(observation: Any) -> Any:
+    if isinstance(observation, np.ndarray):
+        return observation.copy()
+    if isinstance(observation, Mapping):
+        return {key: _copied(value) for key, value in observation.items()}
+    if isinstance(observation, tuple):
+        return tuple(_copied(value) for value in observation)
+    return observation
+
+
+def make_vector_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> SyncVectorEnv:
+    """``num_envs`` environments stepped in turn, without autoreset and without copying twice.
+
+    Example:
+        >>> envs = make_vector_env(lambda: gym.make("CartPole-v1"), 2)
+        >>> envs.num_envs
+        2
+    """
+    check_whole("num_envs", num_envs)
+    return SyncVectorEnv(
+        [partial(_sub_env, make, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
+    )
+
+
+def _sub_env(make: Callable[[], gym.Env[Any, Any]], index: int) -> SubEnv:
+    return SubEnv(make(), index)
