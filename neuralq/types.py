@@ -1,20 +1,29 @@
-"""The two shapes that everything else speaks: a `Transition` and a `QFunction`.
+"""The shapes that everything else speaks: a `Transition`, a `QFunction`, and arrays by what they hold.
 
 Subscripts follow the field: ``_tm1`` is the near side of a transition (the state that was left), ``_t`` the far side
 (the state that was reached). Two facts end an episode and are never merged: `discount_t` is zero where the world
 terminated, so nothing is bootstrapped; `last_t` is true wherever the stream of experience breaks (termination, a time
 limit, an autoreset), so traces and λ-returns stop there although the bootstrap stays.
+
+Importing this module does not import PyTorch: rooms that know arrays only name their types from here, too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["Metrics", "QFunction", "Transition"]
+if TYPE_CHECKING:
+    from torch import Tensor
 
+__all__ = ["Array", "Floats", "Indices", "Metrics", "QFunction", "Transition"]
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Metrics = dict[str, float]
 
 

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.exact.asynchronous_kernels import greedy_trials, predecessors, process_queue, settle
-from neuralq.exact.kernels import sweep
+from neuralq.exact.kernels import Floats, sweep
 from neuralq.exact.problem import Found, Problem
 
 __all__ = ["labelled_rtdp", "prioritized_sweeping", "rtdp"]
 
-Floats = NDArray[np.float64]
 
 _TRIALS_BETWEEN_CHECKS = 64
 _STALLED_CHECKS = 20

@@ -27,13 +27,13 @@ from scipy.sparse.linalg import splu
 
 from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.exact.evaluation import policy_process
+from neuralq.exact.kernels import Floats
 from neuralq.exact.policies import best_rows
 from neuralq.exact.problem import Problem, prepare, q_of_rows
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["AverageEvaluation", "AverageSolution", "evaluate_average", "solve_average"]
 
-Floats = NDArray[np.float64]
 
 _TIE = 1e-10  # relative: what the linear systems of an evaluation leave behind
 _TAU = 0.5

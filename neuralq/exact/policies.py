@@ -17,13 +17,12 @@ from scipy import sparse
 from scipy.optimize import linprog
 from scipy.sparse.linalg import splu
 
-from neuralq.exact.kernels import look_ahead
+from neuralq.exact.kernels import Floats, look_ahead
 from neuralq.exact.problem import Found, Problem
 from neuralq.exact.sweeping import PolicyMatrix
 
 __all__ = ["best_rows", "linear_programming", "policy_iteration", "policy_values"]
 
-Floats = NDArray[np.float64]
 
 _MOST_FACTORED = 3000  # states; beyond, the factors of a matrix without structure may not fit into memory
 _MOST_STEPS = 1e5  # expected steps up to which sweeps evaluate a policy in reasonable time

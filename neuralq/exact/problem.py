@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from neuralq.exact.kernels import Rows, look_ahead
+from neuralq.exact.kernels import Floats, Rows, look_ahead
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["Found", "Problem", "prepare", "q_of_rows", "rows_of", "trapped_rows"]
-
-Floats = NDArray[np.float64]
 
 
 class Found(NamedTuple):

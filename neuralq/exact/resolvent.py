@@ -14,14 +14,14 @@ ways, by what P is:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import gmres, splu
 
+from neuralq.exact.kernels import Floats
+
 __all__ = ["resolvent"]
 
-Floats = NDArray[np.float64]
 
 LARGEST_FACTOR = 30_000_000
 """Numbers in the factors of a sparse chain beyond which it is iterated instead: about 400 MB with their indices."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.exact.kernels import (
+    Floats,
     Rows,
     copy_survivors,
     extract_policy,
@@ -32,7 +33,6 @@ from neuralq.exact.problem import Found, Problem
 
 __all__ = ["PolicyMatrix", "gauss_seidel", "modified_policy_iteration", "value_iteration"]
 
-Floats = NDArray[np.float64]
 
 _PATIENCE = 20  # errors shrink by the modulus; one that finds no new low for so long is at the floor of rounding
 _WORTH_COPYING = 0.2  # share of rows that are far enough below the best

@@ -19,14 +19,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.exact.kernels import improve
+from neuralq.exact.kernels import Floats, improve
 from neuralq.exact.policies import policy_iteration
 from neuralq.exact.problem import Found, Problem, prepare, q_of_rows, trapped_rows
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["bellman_ford", "certified", "episodic", "is_shortest_path", "path_rounding", "proper_policy_iteration"]
-
-Floats = NDArray[np.float64]
 
 
 def episodic(problem: Problem, method: str) -> Problem:

@@ -40,11 +40,11 @@ from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.moments import second_moment_radius, unknowns
 from neuralq.lab.verdicts.update_maps import jumps
 from neuralq.lab.verdicts.words import Verdict
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["ABSENT", "NEUTRAL_BAND", "Cell", "Matrix", "Sampled", "applies", "matrix", "outcome_of"]
 
-Floats = NDArray[np.float64]
 Outcome = Literal["settles", "grows", "keeps moving"]
 
 NEUTRAL_BAND = 1e-6

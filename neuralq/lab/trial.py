@@ -25,11 +25,11 @@ from neuralq.lab.methods import Expected, Method
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Options, Piece
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["CAP", "Run", "affine_power", "check_coverage", "run"]
 
-Floats = NDArray[np.float64]
 
 CAP = 1e10
 """A seed has diverged when an entry of its weights is larger than this times the largest initial one (at least 1)."""

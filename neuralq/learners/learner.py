@@ -6,18 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from neuralq.checks import check_positive
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.q.engine import Engine, on_arrays
-from neuralq.types import Metrics, Transition
+from neuralq.types import Array, Metrics, Transition
 
 __all__ = ["Descent", "Learner", "Update"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +95,7 @@ class Descent:
         self.follow(scale)
         return errors
 
-    def step_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None, scale: float = 1.0) -> _Array:
+    def step_arrays(self, s: Array, a: Array, target: Array, weight: Array | None, scale: float = 1.0) -> Array:
         """As `step`, with arrays ``[B]``, where `on_arrays` is not None."""
         assert self.on_arrays is not None
         errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.jit import kernel, reassociating_kernel
+from neuralq.types import Array
 
 __all__ = ["FlatOptimiser", "Optimiser", "clip_norm_"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Optimiser:
 
 @kernel
 def _moments_kernel(
-    p: _Array, g: _Array, m: _Array, v: _Array, b1: float, b2: float, rate: float, root: float, eps: float, plain: bool
+    p: Array, g: Array, m: Array, v: Array, b1: float, b2: float, rate: float, root: float, eps: float, plain: bool
 ) -> None:
     c1, c2, step = p.dtype.type(b1), p.dtype.type(b2), p.dtype.type(rate)
     n1, n2 = p.dtype.type(1.0 - b1), p.dtype.type(1.0 - b2)  # in float32, 1 − 0.999 would be wrong by 1.3e-5 of itself
@@ -68,7 +67,7 @@ def _moments_kernel(
 
 
 @reassociating_kernel
-def _square_sum(g: _Array) -> Any:
+def _square_sum(g: Array) -> Any:
     total = g[0] * 0
     for i in range(g.size):
         total += g[i] * g[i]
@@ -76,13 +75,13 @@ def _square_sum(g: _Array) -> Any:
 
 
 @kernel
-def _scale(g: _Array, factor: float) -> None:
+def _scale(g: Array, factor: float) -> None:
     f = g.dtype.type(factor)
     for i in range(g.size):
         g[i] *= f
 
 
-def clip_norm_(grad: Tensor | _Array, max_norm: float) -> None:
+def clip_norm_(grad: Tensor | Array, max_norm: float) -> None:
     """Scale ``grad``, a tensor or an array, in place so that its Euclidean norm is at most ``max_norm``.
 
     Example:
@@ -121,11 +120,11 @@ class FlatOptimiser:
         moments = optimiser.kind != "sgd"
         self._m = torch.zeros_like(values) if moments else None
         self._v = torch.zeros_like(values) if moments else None
-        self._arrays: tuple[_Array, _Array, _Array] | None = None  # the same memory, on CPUs
+        self._arrays: tuple[Array, Array, Array] | None = None  # the same memory, on CPUs
         if self._m is not None and self._v is not None and values.device.type == "cpu":
             self._arrays = values.numpy(), self._m.numpy(), self._v.numpy()
 
-    def step(self, grad: Tensor | _Array, learning_rate: float) -> None:
+    def step(self, grad: Tensor | Array, learning_rate: float) -> None:
         """One descent step along ``grad``; on a CPU it may be an array."""
         self.num_steps += 1
         if self._arrays is not None:

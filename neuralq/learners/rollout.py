@@ -20,11 +20,9 @@ from neuralq.learners.averaging import IterateAverage
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
 from neuralq.q.engine import Engine
-from neuralq.types import Transition
+from neuralq.types import Array, Transition
 
 __all__ = ["RolloutLearner", "RolloutSettings"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True)
@@ -180,7 +178,7 @@ class RolloutLearner:
         return Update(errors, picked)
 
     def _fit_tensors(
-        self, transition: Transition, targets: Tensor, parts: list[_Array], annealed: float
+        self, transition: Transition, targets: Tensor, parts: list[Array], annealed: float
     ) -> tuple[Tensor, Tensor]:
         """A gradient step for each part of the rows; errors and targets of the last."""
         s, a = transition.s_tm1.flatten(0, 1), transition.a_tm1.reshape(-1)
@@ -193,7 +191,7 @@ class RolloutLearner:
         return errors, picked
 
     def _fit_arrays(
-        self, transition: Transition, targets: Tensor, parts: list[_Array], annealed: float
+        self, transition: Transition, targets: Tensor, parts: list[Array], annealed: float
     ) -> tuple[Tensor, Tensor]:
         """The same without making tensors of each part, which for small networks costs as much as a fifth of it."""
         s, a = transition.s_tm1.flatten(0, 1).numpy(), transition.a_tm1.reshape(-1).numpy()

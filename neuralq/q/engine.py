@@ -23,11 +23,9 @@ from neuralq.q.flat import FlatParameters
 from neuralq.q.kernels import batch as kernels
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
-from neuralq.types import QFunction
+from neuralq.types import Array, QFunction
 
 __all__ = ["Engine", "Loss", "MlpEngine", "TorchEngine", "array_values", "make_engine", "on_arrays", "runs_compiled"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True)
@@ -252,10 +250,10 @@ class MlpEngine:
         self._reserve(rows.shape[0])
         return np.ascontiguousarray(rows), leading
 
-    def _array_rows(self, s: _Array) -> _Array:
+    def _array_rows(self, s: Array) -> Array:
         """Observations ``[B, *obs]`` as rows; refuses what `_rows` would, the usual kind first."""
         if s.ndim != 2 or s.dtype != self._kind or s.shape[1] != self._width or not s.flags.carray:
-            return cast(_Array, self._rows(torch.from_numpy(s if s.flags.writeable else s.copy()))[0])
+            return cast(Array, self._rows(torch.from_numpy(s if s.flags.writeable else s.copy()))[0])
         if len(s) > self._capacity:
             self._reserve(len(s))
         return s
@@ -266,11 +264,11 @@ class MlpEngine:
         q = torch.from_numpy(self._all(x, target)).view(*leading, self._num_actions)
         return q if self._mask is None else q.masked_fill_(self._mask.illegal(s), -torch.inf)
 
-    def all_arrays(self, s: _Array, target: bool = False) -> _Array:
+    def all_arrays(self, s: Array, target: bool = False) -> Array:
         """As `all`, from observations ``[B, *obs]`` to values ``[B, A]``; for networks with a plain input."""
         return self._all(self._array_rows(s), target)
 
-    def _all(self, x: _Array, target: bool) -> _Array:
+    def _all(self, x: Array, target: bool) -> Array:
         values = self._target_values if target else self._values
         if values is None:
             raise _no_target()
@@ -281,7 +279,7 @@ class MlpEngine:
         )  # fmt: skip
         return out
 
-    def _loss_gradient(self, x: _Array, actions: _Array, target: Any, weight: Any, loss: int) -> Any:
+    def _loss_gradient(self, x: Array, actions: Array, target: Any, weight: Any, loss: int) -> Any:
         if actions.size != len(x):
             raise ValueError(f"got {len(x)} states and {actions.size} actions; they must pair up")
         q = np.empty(len(x), self._kind)
@@ -303,11 +301,11 @@ class MlpEngine:
         q = self._loss_gradient(self._rows(s)[0], a.reshape(-1).numpy(), wanted, weights, self._loss)
         return torch.from_numpy(wanted - q).view(a.shape)
 
-    def loss_gradient_arrays(self, s: _Array, a: _Array, target: _Array, weight: _Array | None = None) -> _Array:
+    def loss_gradient_arrays(self, s: Array, a: Array, target: Array, weight: Array | None = None) -> Array:
         """As `loss_gradient` for ``[B]`` samples in arrays, target and weight in the network's precision."""
         if not len(a) == len(target) == (len(a) if weight is None else len(weight)):
             raise ValueError(f"actions, targets and weights must pair up; got {len(a)} and {len(target)} of them")
-        return cast(_Array, target - self._loss_gradient(self._array_rows(s), a, target, weight, self._loss))
+        return cast(Array, target - self._loss_gradient(self._array_rows(s), a, target, weight, self._loss))
 
     def value_gradient(self, s: Tensor, a: Tensor) -> Tensor:
         """Value of one pair and, in ``flat.grad``, its gradient."""
@@ -369,7 +367,7 @@ def on_arrays(engine: Engine) -> MlpEngine | None:
     return engine if isinstance(engine, MlpEngine) and engine.plain_input else None
 
 
-def array_values(engine: Engine) -> Callable[[_Array], _Array] | None:
+def array_values(engine: Engine) -> Callable[[Array], Array] | None:
     """Observations ``[B, *obs]`` to action values ``[B, A]`` without tensors, where the engine can.
 
     Example:

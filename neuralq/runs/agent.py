@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuralq.runs.stream import Normalisation, ObservationSpec
 from neuralq.runs.stream.acting import choose_greedy
 from neuralq.runs.stream.encoding import Encoder
-from neuralq.runs.stream import Normalisation, ObservationSpec
-from neuralq.types import QFunction
+from neuralq.types import Array, QFunction
 
 __all__ = ["Agent"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Agent:
@@ -45,7 +43,7 @@ class Agent:
         self.reward_scale = reward_scale
         self.normalisation = normalisation
 
-    def values(self, observation: Any, action_mask: Any = None) -> _Array:
+    def values(self, observation: Any, action_mask: Any = None) -> Array:
         """Action values of one observation, in units of the environment's return.
 
         Args:

@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.checks import check_positive
-from neuralq_envs.counterexamples.continuous import ContinuousModel, Floats, Steps
+from neuralq.types import Floats
+from neuralq_envs.counterexamples.continuous import ContinuousModel, Steps
 
 __all__ = ["car_on_the_hill", "gridworld", "puddle_depth", "puddle_world"]
 

@@ -21,10 +21,10 @@ from scipy import sparse
 
 from neuralq.checks import check_whole
 from neuralq.mdp import FiniteMDP
+from neuralq.types import Floats
 
 __all__ = ["ContinuousModel", "Steps", "grid_support", "random_support", "reachable_mdp"]
 
-Floats = NDArray[np.float64]
 _CELL = 1e-8  # states closer than this are one state that was reached by two sums of rounded steps
 
 

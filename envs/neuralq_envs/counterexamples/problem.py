@@ -16,11 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_discount, check_fraction, check_positive
 from neuralq.mdp import FiniteMDP
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.chains import stationary_distribution
 
 __all__ = ["ParametricValue", "Problem"]
-
-Floats = NDArray[np.float64]
 
 
 class ParametricValue(Protocol):

@@ -23,15 +23,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.checks import check_discount
 from neuralq.mdp import FiniteMDP
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.problem import Problem
 
 __all__ = ["SpiralValue", "blow_up_time", "critical_epsilon", "spiral", "theta_at"]
 
-Floats = NDArray[np.float64]
 
 K = math.sqrt(3.0) / 2
 START = (100.0, -70.0, -30.0)

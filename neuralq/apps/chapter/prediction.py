@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from neuralq.apps.pages.page import Chart, Exhibit, Row, Series, claim, misprint, number, own, spread
 from neuralq.exact import evaluate, solve
 from neuralq.rules import lambda_returns
 from neuralq.tabular import Experience, RunOptions, batch_td, predict, td_lambda
+from neuralq.types import Floats
 from neuralq_envs import mitchell, random_walk
 
 __all__ = ["lambda_recursion", "random_walk_page"]
 
-Floats = NDArray[np.float64]
 
 _TRUTH = np.arange(1, 6) / 6
 _START = np.full(7, 0.5)  # what Sutton begins with; the two ends are never read

@@ -22,13 +22,13 @@ from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.recipe.games import make_single
 from neuralq.runs.stream import legal_actions
+from neuralq.types import Array
 
 __all__ = ["export"]
 
 _TOLERANCE = 1e-5
 _OPSET = 17
 _NUM_OBSERVATIONS = 256
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 def export(argv: list[str]) -> int:
@@ -70,7 +70,7 @@ def export(argv: list[str]) -> int:
 
 
 def _write_checked(
-    agent: Agent, config: RunConfig, out: Path, observations: _Array, expected: _Array
+    agent: Agent, config: RunConfig, out: Path, observations: Array, expected: Array
 ) -> tuple[float, float]:
     """Write the file if its values are those expected; how far they differ, and how far they may."""
     partial = out.with_name(f".partial-{out.name}")
@@ -114,7 +114,7 @@ class _Exported(nn.Module):
         return values, values.argmax(-1) + self.first_action
 
 
-def _played(config: RunConfig, agent: Agent) -> tuple[_Array, _Array]:
+def _played(config: RunConfig, agent: Agent) -> tuple[Array, Array]:
     """Encoded observations of random play ``[n, *obs]``, and the agent's values of them ``[n, A]`` float64."""
     env = make_single(config.env, config.env_kwargs)
     rng = np.random.default_rng(0)
@@ -135,7 +135,7 @@ def _played(config: RunConfig, agent: Agent) -> tuple[_Array, _Array]:
     return np.stack(rows), np.stack(values)
 
 
-def _encoded(agent: Agent, observation: Any, mask: Any) -> _Array:
+def _encoded(agent: Agent, observation: Any, mask: Any) -> Array:
     encoded = np.asarray(agent.encoder.encode_single(observation))
     if agent.spec.masked:
         legal = np.ones(agent.spec.num_actions) if mask is None else np.asarray(mask) != 0
@@ -143,7 +143,7 @@ def _encoded(agent: Agent, observation: Any, mask: Any) -> _Array:
     return encoded.astype(agent.spec.dtype)
 
 
-def _write(agent: Agent, observations: _Array, path: Path, config: RunConfig) -> None:
+def _write(agent: Agent, observations: Array, path: Path, config: RunConfig) -> None:
     try:
         import onnx
     except ImportError as error:
@@ -174,7 +174,7 @@ def _write(agent: Agent, observations: _Array, path: Path, config: RunConfig) ->
     onnx.save(model, str(path))
 
 
-def _difference(path: Path, observations: _Array, expected: _Array, agent: Agent) -> tuple[float, float]:
+def _difference(path: Path, observations: Array, expected: Array, agent: Agent) -> tuple[float, float]:
     """Largest difference of values, ∞ where illegal or greedy actions differ, and what float32 is allowed.
 
     Values of some hundreds are known to float32 no better than 1e-5, so the bound is relative above 1.

@@ -21,8 +21,8 @@ from neuralq.checks import check_discount, check_positive, check_whole
 from neuralq.exact import solve
 from neuralq.lab.fitted.diagnosis import FittedDiagnosis, diagnose_fitted
 from neuralq.lab.fitted.grow_support import GrownSupport, greedy_costs, grow_support
-from neuralq.lab.fitted.iteration import Floats
 from neuralq.lab.fitted.regressors import Regressor
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.continuous import ContinuousModel, grid_support, random_support, reachable_mdp
 
 __all__ = ["fitted"]

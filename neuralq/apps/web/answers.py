@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.apps.web.catalogue import problem_named
 from neuralq.lab.linear.process import linear_process
@@ -18,10 +17,10 @@ from neuralq.lab.trial import run
 from neuralq.lab.verdicts.critical import StabilityScan, scan
 from neuralq.lab.verdicts.diagnosis import Diagnosis, diagnose
 from neuralq.lab.verdicts.remedies import Remedy, prescribe
+from neuralq.types import Floats
 
 __all__ = ["answer"]
 
-Floats = NDArray[np.float64]
 Spec = Mapping[str, Any]
 Json = dict[str, Any]
 

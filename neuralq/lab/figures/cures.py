@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.checks import check_discount
 from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
 from neuralq.lab.trial import run
 from neuralq.lab.verdicts.critical import scan
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.baird import critical_gamma
 
@@ -27,8 +27,6 @@ __all__ = [
     "star_critical_lambda",
     "star_critical_phi",
 ]
-
-Floats = NDArray[np.float64]
 
 
 def star_critical_lambda(gamma: float, num_upper: int = 6) -> float:

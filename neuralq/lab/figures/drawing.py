@@ -11,10 +11,8 @@ import textwrap
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from neuralq.figures import COLOURS, MARKERS, draw_png, draw_svg, tame
+from neuralq.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["EXACT", "Curve", "Drawing", "Panel", "png_of", "svg_of"]
 
-Floats = NDArray[np.float64]
 EXACT = 6
 """The colour (black) of an exact line that belongs to no single curve."""
 

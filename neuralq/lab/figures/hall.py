@@ -11,7 +11,6 @@ state, so after many sweeps k it is c u_1(1) ((κ − 1)/(κ + 1))ᵏ, c the sha
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
@@ -22,7 +21,6 @@ from neuralq_envs.counterexamples.hall import hall
 
 __all__ = ["figure_hall", "modal_sweeps", "predicted_sweeps", "sweeps_until"]
 
-Floats = NDArray[np.float64]
 _SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
 from neuralq.lab.linear.process import linear_process
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.spiral import SpiralValue, blow_up_time, spiral, theta_at
 
 __all__ = ["figure_spiral", "spiral_updates"]
-
-Floats = NDArray[np.float64]
 
 
 def spiral_updates(step_size: float, largest: float = 1e6) -> Floats:

@@ -25,11 +25,11 @@ from neuralq.lab.methods.method import Options
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.trial import run
 from neuralq.lab.verdicts.moments import Jumps, jumps
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem, star
 
 __all__ = ["chain_moments", "figure_11_2", "figure_11_5", "figure_11_6", "sampled_weights"]
 
-Floats = NDArray[np.float64]
 _BAND = (0.1, 0.9)
 _WEIGHTS = (("w1 to w6 (mean)", 0), ("w7", 1), ("w8", 2))
 

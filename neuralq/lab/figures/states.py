@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
 from neuralq.lab.linear.process import linear_process
@@ -11,12 +10,11 @@ from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.operators import td
 from neuralq.lab.trial import run
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.chattering import chattering, greedy_share, policy_fixed_points
 from neuralq_envs.counterexamples.kolter import critical_probability, kolter
 
 __all__ = ["figure_chattering", "figure_kolter"]
-
-Floats = NDArray[np.float64]
 
 
 def figure_kolter(

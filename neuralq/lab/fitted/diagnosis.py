@@ -30,7 +30,6 @@ __all__ = [
     "policy_growth",
 ]
 
-Floats = NDArray[np.float64]
 _ROUNDING = 1e-9  # a row of weights may be off by this much and still count as non-negative with sum 1
 _SMALL = 400  # support points up to which all eigenvalues are quicker than some
 

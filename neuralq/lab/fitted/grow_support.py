@@ -21,11 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_positive, check_whole
 from neuralq.lab.fitted.regressors import FittedRegressor, Regressor
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
 __all__ = ["GrownSupport", "confirmed_costs", "greedy_costs", "grow_support"]
 
-Floats = NDArray[np.float64]
 _NEVER = np.inf  # inside a rollout only: a path that was given up
 
 

@@ -27,11 +27,10 @@ from scipy import sparse
 from neuralq.checks import check_discount, check_positive, check_whole
 from neuralq.lab.fitted.regressors import Hat, LinearSmoother, Regressor
 from neuralq.mdp import FiniteMDP
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
 __all__ = ["FittedRun", "Sweep", "fitted_iteration", "iterate", "sweep_of_mdp", "sweep_of_model"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neuralq.checks import check_whole
+from neuralq.types import Floats
 
 __all__ = ["NetworkRegressor"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

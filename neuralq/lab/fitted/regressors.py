@@ -24,6 +24,7 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from neuralq.checks import check_choice, check_positive, check_whole
+from neuralq.types import Floats
 
 __all__ = [
     "FittedRegressor",
@@ -40,7 +41,6 @@ __all__ = [
     "quadratic_features",
 ]
 
-Floats = NDArray[np.float64]
 Hat = Any  # a float64 array [queries, support], dense or scipy.sparse.csr_array
 
 

@@ -17,16 +17,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from neuralq.exact import resolvent
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["Arcs", "Process", "linear_process"]
 
-Floats = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 LARGEST_DENSE = 2000
 """Rows up to which chains are kept as dense arrays: beyond, products with sparse ones are cheaper and fit in memory."""
@@ -46,13 +44,13 @@ class Arcs:
         starts: arcs of row i are ``starts[i]:starts[i + 1]``, ``[n + 1]``.
     """
 
-    row: Index
-    next_row: Index
+    row: Indices
+    next_row: Indices
     probability: Floats
     rho: Floats
     reward: Floats
     discount: Floats
-    starts: Index
+    starts: Indices
 
     @cached_property
     def ladder(self) -> Floats:
@@ -96,11 +94,11 @@ class Process:
     gamma: float
     arcs: Arcs
     target_arcs: Arcs
-    pairs: Index | None
-    state: Index
+    pairs: Indices | None
+    state: Indices
     target_policy: Floats
     behaviour_policy: Floats
-    row_of: Index | None
+    row_of: Indices | None
 
     @property
     def num_rows(self) -> int:
@@ -190,7 +188,7 @@ def _of_pairs(problem: Problem) -> Process:
                      mdp.s_tm1, mdp.row_index)  # fmt: skip
 
 
-def _go_on(problem: Problem, number: Index, row: Index, chance: Floats) -> tuple[Index, Index, Floats, Index]:
+def _go_on(problem: Problem, number: Indices, row: Indices, chance: Floats) -> tuple[Indices, Indices, Floats, Indices]:
     """Model rows spread over their successors, ends included: ``(row, next, probability, model row)`` of each arc.
 
     Args:
@@ -214,7 +212,7 @@ def _go_on(problem: Problem, number: Index, row: Index, chance: Floats) -> tuple
     return row[source[kept]], successor[kept], p[kept], source[kept]
 
 
-def _arcs(problem: Problem, n: int, row: Index, next_row: Index, p: Floats, rho: Floats, reward: Floats) -> Arcs:
+def _arcs(problem: Problem, n: int, row: Indices, next_row: Indices, p: Floats, rho: Floats, reward: Floats) -> Arcs:
     order = np.lexsort((next_row, row))
     row, next_row = row[order], next_row[order]
     discount = np.where(next_row < 0, 0.0, problem.gamma)
@@ -223,8 +221,8 @@ def _arcs(problem: Problem, n: int, row: Index, next_row: Index, p: Floats, rho:
 
 
 def _assemble(
-    problem: Problem, X: Floats, D: Floats, start: Floats, arcs: Arcs, target_arcs: Arcs, pairs: Index | None,
-    state: Index, row_of: Index | None,
+    problem: Problem, X: Floats, D: Floats, start: Floats, arcs: Arcs, target_arcs: Arcs, pairs: Indices | None,
+    state: Indices, row_of: Indices | None,
 ) -> Process:  # fmt: skip
     n = len(D)
     chains, rewards = [], []

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Arcs, Process
+from neuralq.types import Floats, Indices
 
 __all__ = ["Sample", "Sampling", "sample_of_arcs", "stream"]
 
-Floats = NDArray[np.float64]
-Index = NDArray[np.int64]
 Sampling = Literal["expected", "iid", "markov"]
 
 
@@ -35,8 +34,8 @@ class Sample:
         begins: whether an episode begins here, so that traces start anew, ``[N]``.
     """
 
-    row: Index
-    next_row: Index
+    row: Indices
+    next_row: Indices
     x: Floats
     x_next: Floats
     x_second: Floats
@@ -47,7 +46,7 @@ class Sample:
     begins: NDArray[np.bool_]
 
 
-def sample_of_arcs(process: Process, arc: Index, second: Index, begins: NDArray[np.bool_]) -> Sample:
+def sample_of_arcs(process: Process, arc: Indices, second: Indices, begins: NDArray[np.bool_]) -> Sample:
     """The transitions along given arcs of the behaviour, with second successors along given arcs of the target.
 
     Args:
@@ -108,18 +107,18 @@ def stream(
         begins = ended
 
 
-def _features(process: Process, row: Index) -> Floats:
+def _features(process: Process, row: Indices) -> Floats:
     x = process.X[row]
     x[row < 0] = 0.0
     return x
 
 
-def _draw(cumulative: Floats, u: Floats) -> Index:
+def _draw(cumulative: Floats, u: Floats) -> Indices:
     """Indices with the chances whose running sum is given; never one of chance 0."""
     return np.asarray(np.searchsorted(cumulative, u * cumulative[-1], side="right"), dtype=np.int64)
 
 
-def _climb(arcs: Arcs, row: Index, u: Floats) -> Index:
+def _climb(arcs: Arcs, row: Indices, u: Floats) -> Indices:
     """An arc of each row with its chance."""
-    found: Index = np.minimum(np.searchsorted(arcs.ladder, row + u, side="right"), arcs.starts[row + 1] - 1)
+    found: Indices = np.minimum(np.searchsorted(arcs.ladder, row + u, side="right"), arcs.starts[row + 1] - 1)
     return found

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process
+from neuralq.types import Floats
 
 __all__ = [
     "Limit",
@@ -34,7 +35,6 @@ __all__ = [
     "visible_process",
 ]
 
-Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 NEUTRAL = 1e-9

@@ -10,17 +10,15 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from neuralq.lab.linear.process import Process
-from neuralq.lab.methods.method import Floats
+from neuralq.types import Floats, Indices
 
 __all__ = ["chain_of", "epsilon_greedy", "greedy_policy", "greedy_values", "pairs_of", "solve_chain", "visits_of"]
 
 Chain: TypeAlias = Floats | sparse.csr_array
-Index = NDArray[np.int64]
 
 
 def solve_chain(P: Chain, discount: float, right: Floats, transposed: bool = False) -> Floats:
@@ -54,7 +52,7 @@ def solve_chain(P: Chain, discount: float, right: Floats, transposed: bool = Fal
         ) from error
 
 
-def pairs_of(process: Process, method: str) -> Index:
+def pairs_of(process: Process, method: str) -> Indices:
     """Row of every pair, ``[S, A]``, -1 where there is none.
 
     Raises:
@@ -75,14 +73,14 @@ def pairs_of(process: Process, method: str) -> Index:
     return process.row_of
 
 
-def greedy_values(process: Process, row_of: Index, w: Floats) -> Floats:
+def greedy_values(process: Process, row_of: Indices, w: Floats) -> Floats:
     """Q(s, a) at the weights, −∞ for illegal pairs: ``[d] -> [S, A]``, or ``[N, d] -> [N, S, A]`` for many seeds."""
     values = (w @ process.X.T)[..., row_of]
     masked: Floats = np.where(row_of >= 0, values, -np.inf)
     return masked
 
 
-def greedy_policy(process: Process, row_of: Index, w: Floats, epsilon: float = 0.0) -> Floats:
+def greedy_policy(process: Process, row_of: Indices, w: Floats, epsilon: float = 0.0) -> Floats:
     """The ε-greedy policy at the weights, ``[S, A]``: ε is shared among all legal actions, the rest goes to the best.
 
     Source: Sutton & Barto 2018, section 2.2.
@@ -99,7 +97,7 @@ def greedy_policy(process: Process, row_of: Index, w: Floats, epsilon: float = 0
     return epsilon_greedy(row_of, greedy_values(process, row_of, w).argmax(axis=-1), epsilon)
 
 
-def epsilon_greedy(row_of: Index, best: Index, epsilon: float) -> Floats:
+def epsilon_greedy(row_of: Indices, best: Indices, epsilon: float) -> Floats:
     """The ε-greedy policy of given best actions, ``[S] -> [S, A]``: ε is shared among all legal actions.
 
     Example:
@@ -113,7 +111,7 @@ def epsilon_greedy(row_of: Index, best: Index, epsilon: float) -> Floats:
     return policy
 
 
-def chain_of(process: Process, row_of: Index, policy: Floats) -> Chain:
+def chain_of(process: Process, row_of: Indices, policy: Floats) -> Chain:
     """The chain over pairs under any policy, ``[n, n]``, dense where the process is.
 
     Example:
@@ -129,7 +127,7 @@ def chain_of(process: Process, row_of: Index, policy: Floats) -> Chain:
     return np.asarray(chain.toarray()) if isinstance(process.P, np.ndarray) else chain
 
 
-def visits_of(process: Process, row_of: Index, policy: Floats) -> Floats:
+def visits_of(process: Process, row_of: Indices, policy: Floats) -> Floats:
     """How often each pair is visited in the long run when the policy itself acts and episodes start again, ``[n]``.
 
     Raises:
@@ -160,14 +158,14 @@ def visits_of(process: Process, row_of: Index, policy: Floats) -> Floats:
     return visits
 
 
-def _into_states(process: Process, row_of: Index) -> sparse.csr_array:
+def _into_states(process: Process, row_of: Indices) -> sparse.csr_array:
     """p(s'|s, a), ``[n, S]``."""
     n = process.num_rows
     belongs = sparse.csr_array((np.ones(n), (np.arange(n), process.state)), shape=(n, len(row_of)))
     return sparse.csr_array(sparse.csr_array(process.P_mu) @ belongs)
 
 
-def _choices(process: Process, row_of: Index, policy: Floats) -> sparse.csr_array:
+def _choices(process: Process, row_of: Indices, policy: Floats) -> sparse.csr_array:
     """A policy as chances of rows given states, ``[S, n]``."""
     s, a = np.nonzero((row_of >= 0) & (policy > 0))
     return sparse.csr_array((policy[s, a], (s, row_of[s, a])), shape=(len(row_of), process.num_rows))

@@ -25,7 +25,8 @@ from neuralq.checks import check_fraction
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import chain_of, epsilon_greedy, greedy_values, pairs_of, visits_of
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
+from neuralq.lab.methods.method import Expected, Method, Options, Piece
+from neuralq.types import Floats
 
 __all__ = ["Q_LEARNING", "SARSA", "piece_of_policy"]
 

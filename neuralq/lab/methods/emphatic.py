@@ -23,8 +23,9 @@ from neuralq.checks import check_fraction
 from neuralq.lab.linear.process import LARGEST_DENSE, Process
 from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import solve_chain
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
+from neuralq.lab.methods.method import Expected, Method, Options, flow
 from neuralq.lab.methods.td import errors
+from neuralq.types import Floats
 
 __all__ = ["ETD", "emphasis", "expected_emphatic_run", "follow_on", "follow_on_second_moment"]
 

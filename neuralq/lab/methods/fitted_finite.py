@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from neuralq.checks import check_positive, check_whole
+from neuralq.types import Floats
 from neuralq_envs.counterexamples.problem import Problem
 
 __all__ = ["FittedWeights", "evaluation_matrix", "fitted_evaluation", "fitted_q_iteration"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

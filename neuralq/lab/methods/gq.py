@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuralq.lab.linear.process import Index, Process
+from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import greedy_values
 from neuralq.lab.methods.gradient import corrected_flow, dot, has_trace, step_ratio, with_helpers
-from neuralq.lab.methods.method import Expected, Floats, Method, Options
+from neuralq.lab.methods.method import Expected, Method, Options
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.methods.trace import Trace
+from neuralq.types import Floats, Indices
 
 __all__ = ["GQ", "GREEDY_GQ", "greedy_rows"]
 
@@ -76,7 +77,7 @@ def _own_ratio(process: Process) -> Floats:
     return np.where(mu > 0, pi / np.where(mu > 0, mu, 1.0), 0.0)
 
 
-def table_of_pairs(process: Process, name: str) -> Index:
+def table_of_pairs(process: Process, name: str) -> Indices:
     """The row of every pair, ``[S, A]``.
 
     Raises:
@@ -87,7 +88,7 @@ def table_of_pairs(process: Process, name: str) -> Index:
     return process.row_of
 
 
-def greedy_rows(process: Process, w: Floats) -> Index:
+def greedy_rows(process: Process, w: Floats) -> Indices:
     """The row of the greedy pair of every state, ``[S]``, ties to the lowest action; -1 where there is no action.
 
     Args:
@@ -108,7 +109,7 @@ def greedy_rows(process: Process, w: Floats) -> Index:
     """
     row_of = table_of_pairs(process, "a greedy policy")
     best_action = greedy_values(process, row_of, w).argmax(axis=1)
-    best: Index = np.take_along_axis(row_of, best_action[:, None], axis=1)[:, 0]
+    best: Indices = np.take_along_axis(row_of, best_action[:, None], axis=1)[:, 0]
     return best
 
 

@@ -30,10 +30,11 @@ from neuralq.checks import check_positive
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
+from neuralq.lab.methods.method import Expected, Method, Options, flow
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.methods.td import errors
 from neuralq.lab.methods.trace import Trace
+from neuralq.types import Floats
 
 __all__ = ["GTD", "GTD2", "GTD2_MP", "HTD", "TDC", "TDRC"]
 

@@ -22,9 +22,10 @@ from neuralq.checks import check_whole
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
+from neuralq.lab.methods.method import Expected, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross, td
 from neuralq.lab.methods.trace import Trace
+from neuralq.types import Floats
 
 __all__ = ["BRM", "FITTED", "FITTED_Q", "LSPI", "LSTD", "PolicyIteration", "lspi"]
 

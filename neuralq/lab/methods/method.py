@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
+from neuralq.types import Floats
 
 __all__ = ["Expected", "Learner", "Method", "Options", "Piece", "flow"]
 
-Floats = NDArray[np.float64]
 Options = Mapping[str, float]
 _LARGEST = 1e100
 """What every option stays below: its square is still a finite number."""

@@ -31,8 +31,9 @@ from neuralq.checks import check_fraction, check_positive, check_whole
 from neuralq.lab.linear.process import LARGEST_DENSE, Arcs, Process
 from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods.chains import pairs_of, solve_chain
-from neuralq.lab.methods.method import Expected, Floats, Learner, Method, Options, flow
+from neuralq.lab.methods.method import Expected, Learner, Method, Options, flow
 from neuralq.lab.methods.td import errors
+from neuralq.types import Floats
 
 __all__ = ["EXPECTED_SARSA", "NAIVE_Q", "NSTEP", "RETRACE", "TREE_BACKUP", "VTRACE"]
 

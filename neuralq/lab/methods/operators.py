@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
-from neuralq.lab.methods.method import Floats
+from neuralq.types import Floats
 
 __all__ = ["covariance", "cross", "naive_residual", "td"]
 

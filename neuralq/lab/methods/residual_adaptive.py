@@ -26,9 +26,10 @@ import numpy as np
 from neuralq.checks import check_fraction, check_positive
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Floats, Method, Options
+from neuralq.lab.methods.method import Expected, Method, Options
 from neuralq.lab.methods.operators import td
 from neuralq.lab.methods.td import errors
+from neuralq.types import Floats
 
 __all__ = ["RESIDUAL_ADAPTIVE", "least_phi"]
 

@@ -24,8 +24,9 @@ import numpy as np
 from neuralq.checks import check_positive, check_whole
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, Piece
+from neuralq.lab.methods.method import Expected, Method, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross
+from neuralq.types import Floats
 
 __all__ = ["HARD_TARGET", "POLYAK_TARGET", "PROJECTED_TARGET", "frozen_target_map"]
 

@@ -17,9 +17,10 @@ import numpy as np
 
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Floats, Method, Options, flow
+from neuralq.lab.methods.method import Expected, Method, Options, flow
 from neuralq.lab.methods.operators import naive_residual, td
 from neuralq.lab.methods.trace import Trace
+from neuralq.types import Floats
 
 __all__ = ["NAIVE_RESIDUAL", "RESIDUAL", "TD"]
 

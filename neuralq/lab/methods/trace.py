@@ -6,7 +6,7 @@ import numpy as np
 
 from neuralq.checks import check_fraction
 from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Floats
+from neuralq.types import Floats
 
 __all__ = ["Trace"]
 

@@ -20,7 +20,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor, nn
 
@@ -29,6 +28,7 @@ from neuralq.exact import action_values, evaluate, predict_expected_td, rmsve, s
 from neuralq.lab.networks.expected import ExpectedBackup, QModule, expected_backup, expected_td_step, local_growth
 from neuralq.lab.networks.tangent_kernel import local_system, local_verdict, observations_of, reduced_operator
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = [
@@ -50,7 +50,6 @@ _LAYOUTS: dict[str, Callable[..., QModule]] = {
 }
 _BODY = MLP(hidden=(16,))
 
-Floats = NDArray[np.float64]
 Start = tuple[QModule, ExpectedBackup]
 
 

@@ -20,18 +20,16 @@ from typing import Literal, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neuralq.checks import check_positive
 from neuralq.exact import Prediction, predict_expected_td
 from neuralq.lab.networks.expected import QModule
 from neuralq.lab.networks.tangent_kernel import value_jacobian
-from neuralq.types import Transition
+from neuralq.types import Floats, Transition
 
 __all__ = ["SampleDiagnosis", "diagnose_sample"]
 
-Floats = NDArray[np.float64]
 
 _NOISE = 0.5  # over √B, of the largest eigenvalue: what an eigenvalue may be off by chance, by a rule of thumb
 

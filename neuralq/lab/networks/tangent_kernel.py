@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 
 from neuralq.lab.networks.expected import ExpectedBackup, QModule
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = [
@@ -28,7 +29,6 @@ __all__ = [
     "value_jacobian",
 ]
 
-Floats = NDArray[np.float64]
 
 _AT_ONCE = 256  # rows of J computed together
 

@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from neuralq.checks import check_choice, check_positive
@@ -27,11 +26,10 @@ from neuralq.lab.linear.spectrum import flow_spectrum, moving_spectrum, visible_
 from neuralq.lab.methods import Method
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Options
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["CRITICAL_PARAMETERS", "NoBoundary", "StabilityScan", "critical", "scan", "stability_margin"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

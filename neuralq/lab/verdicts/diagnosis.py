@@ -46,11 +46,11 @@ from neuralq.lab.verdicts.moments import (
 from neuralq.lab.verdicts.piecewise import follow
 from neuralq.lab.verdicts.update_maps import Jumps, jumps
 from neuralq.lab.verdicts.words import Diagnosis, Verdict, is_poor
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["Diagnosis", "diagnose"]
 
-Floats = NDArray[np.float64]
 Factors = NDArray[np.complex128]
 
 MOST_SCANNED = 1000

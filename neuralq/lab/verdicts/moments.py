@@ -30,6 +30,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.spectrum import moving_space
 from neuralq.lab.verdicts.update_maps import Jumps, jumps
+from neuralq.types import Floats, Indices
 
 __all__ = [
     "Jumps",
@@ -43,8 +44,6 @@ __all__ = [
     "unknowns",
 ]
 
-Floats = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 LARGEST_DENSE = 1000
 """Unknowns up to which an operator is written as a matrix; beyond, it is applied without one."""
@@ -236,7 +235,7 @@ def _parts(maps: Jumps, sampling: str) -> list[NDArray[np.bool_]]:
     return parts
 
 
-def _arrivals(maps: Jumps, rows: Index) -> sparse.csr_array:
+def _arrivals(maps: Jumps, rows: Indices) -> sparse.csr_array:
     """Where each arc leads, ``[len(rows), K]``: to one row, or, after an end, to every row as its start chance says."""
     number = np.full(maps.num_rows + 1, -1, dtype=np.int64)
     number[rows] = np.arange(len(rows))
@@ -254,7 +253,7 @@ def _one_row(maps: Jumps) -> Jumps:
     return Jumps(maps.M, maps.c, zero, zero, maps.weight, np.ones(1), np.ones(1))
 
 
-def _triangle(q: int) -> tuple[Index, Index]:
+def _triangle(q: int) -> tuple[Indices, Indices]:
     lower = np.tril_indices(q)
     return np.asarray(lower[0]), np.asarray(lower[1])
 
@@ -280,7 +279,7 @@ def _blocks(maps: Jumps, moment: int) -> Floats:
     return np.asarray(p * np.where(i == j, straight, straight + crossed))
 
 
-def _dense(maps: Jumps, rows: Index, moment: int) -> Floats:
+def _dense(maps: Jumps, rows: Indices, moment: int) -> Floats:
     blocks = _blocks(maps, moment)
     n, m = len(rows), blocks.shape[1]
     origin = np.searchsorted(rows, maps.row)

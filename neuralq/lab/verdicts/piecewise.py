@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.lab.linear.spectrum import limit_of, moving_spectrum
 from neuralq.lab.methods import Expected
 from neuralq.lab.methods.method import Piece
 from neuralq.lab.verdicts.words import Region
+from neuralq.types import Floats
 
 __all__ = ["Path", "follow"]
 
-Floats = NDArray[np.float64]
 
 CAP = 1e12
 """A run has diverged when it is this many times as large as its start (at least 1)."""

@@ -16,11 +16,10 @@ from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import sample_of_arcs
 from neuralq.lab.methods import Method
 from neuralq.lab.methods.method import Options
+from neuralq.types import Floats, Indices
 
 __all__ = ["Jumps", "jumps"]
 
-Floats = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 LARGEST = 20_000_000
 """Numbers in all maps beyond which they are refused: 160 MB."""
@@ -44,8 +43,8 @@ class Jumps:
 
     M: Floats
     c: Floats
-    row: Index
-    next_row: Index
+    row: Indices
+    next_row: Indices
     probability: Floats
     D: Floats
     start: Floats
@@ -121,7 +120,7 @@ def jumps(process: Process, method: Method, options: Options, step_size: float) 
 
 
 def _maps(
-    process: Process, method: Method, options: Options, step_size: float, size: int, arc: Index, second: Index
+    process: Process, method: Method, options: Options, step_size: float, size: int, arc: Indices, second: Indices
 ) -> tuple[Floats, Floats]:
     probes = np.vstack([np.zeros(size), np.eye(size)])
     M, c = np.empty((len(arc), size, size)), np.empty((len(arc), size))
@@ -138,7 +137,7 @@ def _maps(
 
 
 def _updated(
-    process: Process, method: Method, options: Options, step_size: float, theta: Floats, arc: Index, second: Index
+    process: Process, method: Method, options: Options, step_size: float, theta: Floats, arc: Indices, second: Indices
 ) -> Floats:
     assert method.learner is not None
     learner = method.learner(process, theta[:, : process.num_weights].copy(), options)

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from neuralq.lab.linear.sampling import Sampling
 from neuralq.lab.methods.method import Options
+from neuralq.types import Floats
 
 __all__ = ["POOR", "Diagnosis", "Region", "Verdict", "is_poor"]
 
-Floats = NDArray[np.float64]
 
 Verdict = Literal[
     "converges",

@@ -10,19 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neuralq.checks import check_fraction, check_positive
-from neuralq.types import Transition
+from neuralq.types import Array, Indices, Transition
 
 __all__ = ["Batch", "Output", "Prioritised", "as_array", "scratch_file"]
 
 PAIRED_ROW_BYTES = 1024
 """Observations above this size are handed out with their successor right behind them."""
-
-Array = NDArray[Any]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

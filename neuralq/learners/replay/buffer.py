@@ -24,19 +24,17 @@ from typing import Any
 import numpy as np
 import torch
 from numba.core.errors import TypingError
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 from torch import Tensor
 
 from neuralq.checks import check_fits, check_fraction, check_whole
 from neuralq.learners.replay.arrays import Batch, Output, Prioritised, as_array, scratch_file
 from neuralq.learners.replay.kernels import RECORD, gather, gather_blocks, locate, store, store_one, synchronise
 from neuralq.learners.replay.sum_tree import SumTree
-from neuralq.types import Transition
+from neuralq.types import Array, Indices, Transition
 
 __all__ = ["Batch", "Prioritised", "ReplayBuffer"]
 
-Array = NDArray[Any]
-Indices = NDArray[np.int64]
 
 EXACT_ROW_BYTES = 1024
 """Observations up to this size get two rows per step, so that any stream fills the capacity exactly."""

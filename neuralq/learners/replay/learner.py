@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,11 +20,9 @@ from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.settings import CORRECTED_RULES, ReplaySettings
 from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
 from neuralq.q.engine import Engine
-from neuralq.types import Transition
+from neuralq.types import Array, Transition
 
 __all__ = ["ReplayLearner"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class ReplayLearner:
@@ -63,7 +60,7 @@ class ReplayLearner:
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
         self._seen: Transition | None = None
-        self._seen_arrays: tuple[_Array, ...] | None = None
+        self._seen_arrays: tuple[Array, ...] | None = None
         engine.sync_target()
         one = torch.ones(1, dtype=engine.flat.values.dtype)
         q_learning_targets(one, one, one[:, None])  # compiled here, so that a run's clock measures training
@@ -123,7 +120,7 @@ class ReplayLearner:
         self._count()
         return Update(errors, targets)
 
-    def _arrays_of(self, transition: Transition) -> tuple[_Array, ...] | None:
+    def _arrays_of(self, transition: Transition) -> tuple[Array, ...] | None:
         """Observation, action, reward, discount and successor as arrays, where the quick way applies.
 
         A replay buffer hands out the same tensors every time, so their arrays are made once.
@@ -137,7 +134,7 @@ class ReplayLearner:
                 self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))
         return self._seen_arrays
 
-    def _update_arrays(self, arrays: tuple[_Array, ...], weight: _Array | None) -> Update:
+    def _update_arrays(self, arrays: tuple[Array, ...], weight: Array | None) -> Update:
         """`update` by one-step Q-learning, without tensors."""
         s_tm1, a_tm1, r_t, discount_t, s_t = arrays
         assert self._descent.on_arrays is not None

@@ -10,15 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.checks import check_whole
 from neuralq.jit import kernel
+from neuralq.types import Floats, Indices
 
 __all__ = ["SumTree"]
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 class SumTree:

@@ -6,22 +6,19 @@ tenth of the whole step. The rule stays the definition; tests/test_bootstrap.py 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from neuralq import rules
 from neuralq.jit import kernel
+from neuralq.types import Array
 
 __all__ = ["q_learning_array_targets", "q_learning_targets"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
-
 
 @kernel
-def _targets(r_t: _Array, discount_t: _Array, q_t: _Array, reward_scale: float, out: _Array) -> None:
+def _targets(r_t: Array, discount_t: Array, q_t: Array, reward_scale: float, out: Array) -> None:
     scale = out.dtype.type(reward_scale)
     for i in range(out.size):
         best = q_t[i, 0]
@@ -56,7 +53,7 @@ def q_learning_targets(r_t: Tensor, discount_t: Tensor, q_t: Tensor, reward_scal
     return torch.from_numpy(q_learning_array_targets(r_t.numpy(), discount_t.numpy(), q_t.numpy(), reward_scale))
 
 
-def q_learning_array_targets(r_t: _Array, discount_t: _Array, q_t: _Array, reward_scale: float = 1.0) -> _Array:
+def q_learning_array_targets(r_t: Array, discount_t: Array, q_t: Array, reward_scale: float = 1.0) -> Array:
     """As `q_learning_targets` from arrays ``[B]``, ``[B]`` and ``[B, A]`` of one precision.
 
     Example:

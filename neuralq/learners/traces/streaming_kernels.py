@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from neuralq.jit import reassociating_kernel
+from neuralq.types import Array
 
 __all__ = ["ADAPTIVE", "CONV", "DENSE", "INTENTIONAL", "OBGD", "advance", "learn", "values_of"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 DENSE, CONV = 0, 1
 OBGD, ADAPTIVE, INTENTIONAL = 0, 1, 2
@@ -35,7 +35,7 @@ _EPSILON, _CLIP, _CLIP_DECAY = 1e-8, 20.0, 0.9998  # as in neuralq.rules.streami
 
 
 @reassociating_kernel
-def _dense(params: _Array, row: _Array, x: _Array, y: _Array) -> None:
+def _dense(params: Array, row: Array, x: Array, y: Array) -> None:
     fan_in, fan_out = row[1], row[2]
     for j in range(fan_out):
         y[j] = params[row[4] + j]
@@ -48,7 +48,7 @@ def _dense(params: _Array, row: _Array, x: _Array, y: _Array) -> None:
 
 
 @reassociating_kernel
-def _patches(row: _Array, x: _Array, cols: _Array) -> None:
+def _patches(row: Array, x: Array, cols: Array) -> None:
     """What each weight of a kernel meets, one contiguous row of all positions after another."""
     side, stride, high, wide = row[11], row[12], row[13], row[14]
     at = 0
@@ -63,7 +63,7 @@ def _patches(row: _Array, x: _Array, cols: _Array) -> None:
 
 
 @reassociating_kernel
-def _conv(params: _Array, row: _Array, x: _Array, y: _Array, cols: _Array) -> None:
+def _conv(params: Array, row: Array, x: Array, y: Array, cols: Array) -> None:
     size = row[13] * row[14]
     _patches(row, x, cols)
     at = row[3]
@@ -79,7 +79,7 @@ def _conv(params: _Array, row: _Array, x: _Array, y: _Array, cols: _Array) -> No
 
 
 @reassociating_kernel
-def _normalise(params: _Array, row: _Array, y: _Array, hat: _Array) -> Any:
+def _normalise(params: Array, row: Array, y: Array, hat: Array) -> Any:
     """Ba et al. (2016) over the whole layer; returns 1/σ."""
     size = y.size
     total = y[0] * 0
@@ -101,7 +101,7 @@ def _normalise(params: _Array, row: _Array, y: _Array, hat: _Array) -> Any:
 
 
 @reassociating_kernel
-def _activate(y: _Array, activation: int) -> None:
+def _activate(y: Array, activation: int) -> None:
     if activation == 0:
         for j in range(y.size):
             y[j] = y.dtype.type(0) if y[j] <= 0 else y[j]  # NaN stays
@@ -115,16 +115,16 @@ def _activate(y: _Array, activation: int) -> None:
 
 @reassociating_kernel
 def _forward(
-    params: _Array,
-    plan: _Array,
-    starts: _Array,
+    params: Array,
+    plan: Array,
+    starts: Array,
     activation: int,
-    x: _Array,
-    acts: _Array,
-    hats: _Array,
-    inverse: _Array,
-    cols: _Array,
-) -> _Array:
+    x: Array,
+    acts: Array,
+    hats: Array,
+    inverse: Array,
+    cols: Array,
+) -> Array:
     h = x
     for layer in range(plan.shape[0]):
         row = plan[layer]
@@ -144,8 +144,8 @@ def _forward(
 
 @reassociating_kernel
 def values_of(
-    params: _Array, plan: _Array, starts: _Array, activation: int, x: _Array, acts: _Array, hats: _Array,
-    inverse: _Array, cols: _Array, out: _Array,
+    params: Array, plan: Array, starts: Array, activation: int, x: Array, acts: Array, hats: Array,
+    inverse: Array, cols: Array, out: Array,
 ) -> None:  # fmt: skip
     """Action values of every row: ``x [B, d]`` into ``out [B, A]``."""
     for i in range(x.shape[0]):
@@ -156,7 +156,7 @@ def values_of(
 
 @reassociating_kernel
 def _through_layer(
-    params: _Array, grads: _Array, row: _Array, d: _Array, y: _Array, hat: _Array, inv: float, activation: int
+    params: Array, grads: Array, row: Array, d: Array, y: Array, hat: Array, inv: float, activation: int
 ) -> None:
     """From the gradient of a hidden layer's output to that of its sums, in place; scale and shift get theirs."""
     size = d.size
@@ -188,7 +188,7 @@ def _through_layer(
 
 
 @reassociating_kernel
-def _dense_back(params: _Array, grads: _Array, row: _Array, d: _Array, x: _Array, below: _Array) -> None:
+def _dense_back(params: Array, grads: Array, row: Array, d: Array, x: Array, below: Array) -> None:
     fan_in, fan_out = row[1], row[2]
     for j in range(fan_out):
         grads[row[4] + j] = d[j]
@@ -206,7 +206,7 @@ def _dense_back(params: _Array, grads: _Array, row: _Array, d: _Array, x: _Array
 
 
 @reassociating_kernel
-def _conv_back(params: _Array, grads: _Array, row: _Array, d: _Array, x: _Array, below: _Array, cols: _Array) -> None:
+def _conv_back(params: Array, grads: Array, row: Array, d: Array, x: Array, below: Array, cols: Array) -> None:
     side, stride, high, wide = row[11], row[12], row[13], row[14]
     size, fan_in = high * wide, row[7] * side * side
     _patches(row, x, cols)
@@ -239,8 +239,8 @@ def _conv_back(params: _Array, grads: _Array, row: _Array, d: _Array, x: _Array,
 
 @reassociating_kernel
 def _backward(
-    params: _Array, grads: _Array, plan: _Array, starts: _Array, activation: int, x: _Array, acts: _Array, hats: _Array,
-    inverse: _Array, deltas: _Array, cols: _Array,
+    params: Array, grads: Array, plan: Array, starts: Array, activation: int, x: Array, acts: Array, hats: Array,
+    inverse: Array, deltas: Array, cols: Array,
 ) -> None:  # fmt: skip
     """Gradient of the output weighted by the top block of ``deltas``, written over ``grads``."""
     top = plan.shape[0] - 1
@@ -263,9 +263,9 @@ def _backward(
 
 @reassociating_kernel
 def learn(
-    params: _Array, grads: _Array, plan: _Array, starts: _Array, activation: int, x_tm1: _Array, a_tm1: int, r_t: float,
-    discount_t: float, x_t: _Array, acts: _Array, hats: _Array, inverse: _Array, deltas: _Array,
-    cols: _Array,
+    params: Array, grads: Array, plan: Array, starts: Array, activation: int, x_tm1: Array, a_tm1: int, r_t: float,
+    discount_t: float, x_t: Array, acts: Array, hats: Array, inverse: Array, deltas: Array,
+    cols: Array,
 ) -> tuple[float, float, bool]:  # fmt: skip
     """Write ∇Q(s_tm1, a_tm1) over ``grads``; returns Q(s_tm1, a_tm1), the target and whether a_tm1 was greedy."""
     num_actions, top = plan[-1, 2], starts[-1]
@@ -291,7 +291,7 @@ def learn(
 
 @reassociating_kernel
 def _advance_bounded(
-    values: _Array, z: _Array, v: _Array, grad: _Array, decay: float, delta: float, bound: int, step_size: float,
+    values: Array, z: Array, v: Array, grad: Array, decay: float, delta: float, bound: int, step_size: float,
     kappa: float, beta2: float, num_updates: int,
 ) -> None:  # fmt: skip
     kind = values.dtype.type
@@ -319,7 +319,7 @@ def _advance_bounded(
 
 @reassociating_kernel
 def _advance_intentional(
-    values: _Array, z: _Array, v: _Array, grad: _Array, means: _Array, decay: float, delta: float, rate: float,
+    values: Array, z: Array, v: Array, grad: Array, means: Array, decay: float, delta: float, rate: float,
     step_size: float, beta2: float, num_updates: int,
 ) -> None:  # fmt: skip
     kind = values.dtype.type
@@ -343,7 +343,7 @@ def _advance_intentional(
 
 @reassociating_kernel
 def advance(
-    values: _Array, z: _Array, v: _Array, grad: _Array, means: _Array, decay: float, delta: float, bound: int,
+    values: Array, z: Array, v: Array, grad: Array, means: Array, decay: float, delta: float, bound: int,
     step_size: float, kappa: float, beta2: float, rate: float, num_updates: int,
 ) -> None:  # fmt: skip
     """Decay the trace, add the gradient, and move the weights as far as the bound allows.

@@ -16,17 +16,16 @@ and compiled again, and that was half of the seconds that the first use on a mac
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (np.dot in kernels uses it; loaded here, thread limits set later reach it)
 
 from neuralq.jit import reassociating_kernel
 from neuralq.q.kernels.products import multiply, suits
+from neuralq.types import Array
 
 __all__ = ["ACTION_INPUT", "ACTION_OUTPUT", "HUBER", "SEPARATE", "SQUARED", "VALUE", "all_values", "loss_gradient"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 ACTION_OUTPUT, SEPARATE, ACTION_INPUT = 0, 1, 2
 SQUARED, HUBER, VALUE = 0, 1, 2
@@ -43,7 +42,7 @@ def _activate(v: float, activation: int) -> float:
 
 
 @reassociating_kernel
-def _normalise_rows(y: _Array, scale: _Array, shift: _Array, hat: _Array, inverse: _Array, activation: int) -> None:
+def _normalise_rows(y: Array, scale: Array, shift: Array, hat: Array, inverse: Array, activation: int) -> None:
     rows, width = y.shape
     for i in range(rows):
         total = y[i, 0] * 0
@@ -75,16 +74,16 @@ def _normalise_rows(y: _Array, scale: _Array, shift: _Array, hat: _Array, invers
 
 @reassociating_kernel
 def _forward(
-    params: _Array,
-    plan: _Array,
-    starts: _Array,
+    params: Array,
+    plan: Array,
+    starts: Array,
     copy: int,
     activation: int,
-    x: _Array,
-    acts: _Array,
-    hats: _Array,
-    inverse: _Array,
-) -> _Array:
+    x: Array,
+    acts: Array,
+    hats: Array,
+    inverse: Array,
+) -> Array:
     rows = x.shape[0]
     num_layers = plan.shape[0]
     h, h_at = x.reshape(-1), 0
@@ -125,7 +124,7 @@ def _forward(
 
 
 @reassociating_kernel
-def _through_activation(d: _Array, y: _Array, activation: int) -> None:
+def _through_activation(d: Array, y: Array, activation: int) -> None:
     """Multiply by the activation's derivative, which all three give from the output alone."""
     rows, width = d.shape
     for i in range(rows):
@@ -141,9 +140,7 @@ def _through_activation(d: _Array, y: _Array, activation: int) -> None:
 
 
 @reassociating_kernel
-def _through_norm(
-    d: _Array, hat: _Array, inverse: _Array, scale: _Array, grad_scale: _Array, grad_shift: _Array
-) -> None:
+def _through_norm(d: Array, hat: Array, inverse: Array, scale: Array, grad_scale: Array, grad_shift: Array) -> None:
     """Ba et al. (2016): dy = (g − mean(g) − ŷ·mean(g·ŷ))/σ with g = d·scale, row by row."""
     rows, width = d.shape
     for i in range(rows):
@@ -166,18 +163,18 @@ def _through_norm(
 
 @reassociating_kernel
 def _backward(
-    params: _Array,
-    grads: _Array,
-    plan: _Array,
-    starts: _Array,
+    params: Array,
+    grads: Array,
+    plan: Array,
+    starts: Array,
     copy: int,
     activation: int,
-    x: _Array,
-    acts: _Array,
-    hats: _Array,
-    inverse: _Array,
-    deltas: _Array,
-    spare: _Array,
+    x: Array,
+    acts: Array,
+    hats: Array,
+    inverse: Array,
+    deltas: Array,
+    spare: Array,
 ) -> None:
     """Gradient of Σ outputs·(their block of ``deltas``), written over ``grads`` of this copy.
 
@@ -227,7 +224,7 @@ def _backward(
 
 
 @reassociating_kernel
-def _pair(pairs: _Array, row: int, x: _Array, i: int, action: int) -> None:
+def _pair(pairs: Array, row: int, x: Array, i: int, action: int) -> None:
     """Write state i with a one-hot action. Loops, here and below: slice assignment doubles the compile time."""
     width = x.shape[1]
     for j in range(width):
@@ -239,18 +236,18 @@ def _pair(pairs: _Array, row: int, x: _Array, i: int, action: int) -> None:
 
 @reassociating_kernel
 def all_values(
-    params: _Array,
-    plan: _Array,
-    starts: _Array,
+    params: Array,
+    plan: Array,
+    starts: Array,
     layout: int,
     num_actions: int,
     activation: int,
-    x: _Array,
-    acts: _Array,
-    hats: _Array,
-    inverse: _Array,
-    pairs: _Array,
-    out: _Array,
+    x: Array,
+    acts: Array,
+    hats: Array,
+    inverse: Array,
+    pairs: Array,
+    out: Array,
 ) -> None:
     """Action values of every action: rows ``x [B, d]`` into ``out [B, A]``."""
     rows, width = x.shape
@@ -285,26 +282,26 @@ def _slope(q: float, target: float, weight: float, loss: int, delta: float, rows
 
 @reassociating_kernel
 def loss_gradient(
-    params: _Array,
-    grads: _Array,
-    plan: _Array,
-    starts: _Array,
+    params: Array,
+    grads: Array,
+    plan: Array,
+    starts: Array,
     layout: int,
     num_actions: int,
     activation: int,
-    x: _Array,
-    a: _Array,
-    target: _Array,
-    weight: _Array,
+    x: Array,
+    a: Array,
+    target: Array,
+    weight: Array,
     loss: int,
     delta: float,
-    acts: _Array,
-    hats: _Array,
-    inverse: _Array,
-    deltas: _Array,
-    pairs: _Array,
-    spare: _Array,
-    q_out: _Array,
+    acts: Array,
+    hats: Array,
+    inverse: Array,
+    deltas: Array,
+    pairs: Array,
+    spare: Array,
+    q_out: Array,
 ) -> int:
     """Write the loss's gradient over ``grads`` and Q(s, a) ``[B]`` into ``q_out``.
 

@@ -15,16 +15,15 @@ from __future__ import annotations
 from typing import Any
 
 import llvmlite.binding
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
 from neuralq.jit import reassociating_kernel
+from neuralq.types import Array
 
 __all__ = ["MAX_PANEL", "MIN_COLUMNS", "multiply", "suits"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 _ROWS, _VECTORS = 6, 2
 """Size of a block: its 12 vectors of sums, two of B and one of A fit into the 16 registers of AVX2."""
@@ -147,8 +146,8 @@ def suits(inner: int, columns: int) -> bool:
 
 @reassociating_kernel
 def multiply(
-    a: _Array, a_at: int, a_row: int, a_inner: int, rows: int, inner: int,
-    b: _Array, b_at: int, columns: int, bias: _Array, bias_at: int, c: _Array, c_at: int,
+    a: Array, a_at: int, a_row: int, a_inner: int, rows: int, inner: int,
+    b: Array, b_at: int, columns: int, bias: Array, bias_at: int, c: Array, c_at: int,
 ) -> None:  # fmt: skip
     """C ← A·B + bias with every operand a place in a flat array.
 

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuralq.runs.sweep.statistics import Estimate, bootstrap_interval, estimate, interquartile_mean
+from neuralq.figures import COLOURS, MARKERS, draw_png, draw_svg, steps_axis, tame
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_config, read_metrics, read_seed
 from neuralq.runs.report.page import flatten
 from neuralq.runs.report.readings import as_float, finite_series
-from neuralq.figures import COLOURS, MARKERS, draw_png, draw_svg, steps_axis, tame
 from neuralq.runs.sweep import is_sweep_folder, open_sweep
+from neuralq.runs.sweep.statistics import Estimate, bootstrap_interval, estimate, interquartile_mean
+from neuralq.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["Curve", "Group", "comparison_png", "comparison_svg", "group_curve", "read_groups"]
 
-_Array = np.ndarray[Any, np.dtype[np.float64]]
 _MOST_POINTS = 120
 _CURVE_RESAMPLES = 1_000
 
@@ -34,8 +34,8 @@ class SeedRun:
 
     path: Path
     seed: int
-    steps: _Array
-    returns: _Array
+    steps: Floats
+    returns: Floats
     env_steps: int
     cpu_seconds: float
 
@@ -89,10 +89,10 @@ class Group:
 class Curve:
     """Interquartile mean over a group's runs at each of ``steps`` ``[P]``; the band is None for a single run."""
 
-    steps: _Array
-    iqm: _Array
-    low: _Array | None
-    high: _Array | None
+    steps: Floats
+    iqm: Floats
+    low: Floats | None
+    high: Floats | None
 
 
 def read_groups(paths: Sequence[str | Path]) -> tuple[list[Group], list[str]]:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from neuralq.runs.report.page import format_number, html_table
 from neuralq.figures import COLOURS, MARKERS, draw_svg, steps_axis, tame
+from neuralq.runs.report.page import format_number, html_table
+from neuralq.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["DivergenceResult", "divergence_svg", "growth_table", "values_table"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class DivergenceResult(Protocol):
@@ -48,22 +47,22 @@ class DivergenceResult(Protocol):
         ...
 
     @property
-    def steps(self) -> int | _Array:
+    def steps(self) -> int | Array:
         """Sweeps at which the error was measured, ``[k]``; or their number k - 1, when it was before and after each."""
         ...
 
     @property
-    def rmsve(self) -> _Array:
+    def rmsve(self) -> Array:
         """Root mean squared value error at these steps, ``[k]``."""
         ...
 
     @property
-    def values(self) -> _Array:
+    def values(self) -> Array:
         """Learned values at the end, one per state."""
         ...
 
     @property
-    def exact_values(self) -> _Array:
+    def exact_values(self) -> Array:
         """True values, one per state."""
         ...
 
@@ -111,18 +110,18 @@ def divergence_svg(results: Sequence[DivergenceResult], *, name: str = "divergen
     return draw_svg(name, "Value error of each representation", description, (5.2, 4.2), paint)
 
 
-def _positive(errors: _Array) -> _Array:
+def _positive(errors: Array) -> Array:
     """Errors that a logarithmic axis can show; zero, NaN and infinity become gaps."""
     array = tame(errors)
     return np.where(array > 1e-150, array, np.nan)
 
 
-def _sweeps(result: DivergenceResult) -> _Array:
+def _sweeps(result: DivergenceResult) -> Array:
     steps = np.asarray(result.steps, np.float64)
     return steps if steps.ndim else np.arange(len(result.rmsve), dtype=np.float64)
 
 
-def _predicted(result: DivergenceResult) -> _Array:
+def _predicted(result: DivergenceResult) -> Array:
     steps, errors = _sweeps(result), _positive(result.rmsve)
     growth = float(result.predicted_growth)
     if not len(errors) or not math.isfinite(errors[0]) or not (math.isfinite(growth) and growth > 0):

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from neuralq.types import Floats
+
 __all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "read_json", "read_metrics", "thin"]
 
 Row = Mapping[str, Any]
-_Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -79,7 +80,7 @@ def rows_by_step(rows: Iterable[Row], kind: str) -> list[tuple[float, Row]]:
     return sorted(latest.items(), key=lambda pair: pair[0])
 
 
-def finite_series(rows: Iterable[Row], kind: str, name: str) -> tuple[_Array, _Array]:
+def finite_series(rows: Iterable[Row], kind: str, name: str) -> tuple[Floats, Floats]:
     """Steps and values of one column where the value is a finite number.
 
     Example:
@@ -101,7 +102,7 @@ def first_not_finite(rows: Iterable[Row], kind: str, name: str) -> int | None:
     return None
 
 
-def quartiles(rows: Iterable[Row]) -> tuple[_Array, _Array, _Array]:
+def quartiles(rows: Iterable[Row]) -> tuple[Floats, Floats, Floats]:
     """Steps, first and third quartile of the returns of each greedy evaluation."""
     kept = []
     for steps, row in rows_by_step(rows, "evaluation"):
@@ -113,7 +114,7 @@ def quartiles(rows: Iterable[Row]) -> tuple[_Array, _Array, _Array]:
     return table[:, 0], table[:, 1], table[:, 2]
 
 
-def thin(x: _Array, y: _Array, most: int = 1200) -> tuple[_Array, _Array]:
+def thin(x: Floats, y: Floats, most: int = 1200) -> tuple[Floats, Floats]:
     """At most about ``most`` points that keep each stretch's lowest and highest value, so no spike is lost.
 
     Example:

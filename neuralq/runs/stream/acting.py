@@ -7,7 +7,6 @@ rule stays the definition; tests/test_acting.py holds this to it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,14 +14,13 @@ from torch import Tensor
 
 from neuralq.checks import check_fraction
 from neuralq.jit import kernel
+from neuralq.types import Array
 
 __all__ = ["EpsilonGreedy", "choose_among", "choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
-
 
 @kernel
-def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -> int:
+def _choose(q: Array, epsilon: float, u: Array, actions: Array, mu: Array) -> int:
     """Fill ``actions`` and ``mu``; returns the first row without a usable action value, or −1."""
     rows, num_actions = q.shape
     for i in range(rows):
@@ -52,7 +50,7 @@ def _choose(q: _Array, epsilon: float, u: _Array, actions: _Array, mu: _Array) -
     return -1
 
 
-def choose_among(q: _Array, epsilon: float, u: _Array) -> tuple[_Array, _Array]:
+def choose_among(q: Array, epsilon: float, u: Array) -> tuple[Array, Array]:
     """As `choose_epsilon_greedy`, from arrays to arrays.
 
     Example:
@@ -78,7 +76,7 @@ def choose_among(q: _Array, epsilon: float, u: _Array) -> tuple[_Array, _Array]:
     return actions, mu
 
 
-def choose_epsilon_greedy(q: Tensor, epsilon: float, u: _Array) -> tuple[Tensor, Tensor]:
+def choose_epsilon_greedy(q: Tensor, epsilon: float, u: Array) -> tuple[Tensor, Tensor]:
     """ε-greedy actions and the probability of each.
 
     Args:
@@ -134,7 +132,7 @@ class EpsilonGreedy:
         values: Callable[[Tensor], Tensor],
         epsilon: Callable[[], float],
         rng: np.random.Generator,
-        array_values: Callable[[_Array], _Array] | None = None,
+        array_values: Callable[[Array], Array] | None = None,
     ) -> None:
         self._values, self._epsilon, self._rng = values, epsilon, rng
         self._array_values = array_values
@@ -144,7 +142,7 @@ class EpsilonGreedy:
         """Actions ``[N]`` and the probability of each."""
         return choose_epsilon_greedy(self._values(s), self._epsilon(), self._rng.random(s.shape[0]))
 
-    def _choose(self, s: _Array) -> tuple[_Array, _Array]:
+    def _choose(self, s: Array) -> tuple[Array, Array]:
         """The same for an array of observations, with the same draws."""
         assert self._array_values is not None
         return choose_among(self._array_values(s), self._epsilon(), self._rng.random(len(s)))
@@ -154,7 +152,7 @@ def epsilon_greedy_policy(
     values: Callable[[Tensor], Tensor],
     epsilon: Callable[[], float],
     rng: np.random.Generator,
-    array_values: Callable[[_Array], _Array] | None = None,
+    array_values: Callable[[Array], Array] | None = None,
 ) -> EpsilonGreedy:
     """A policy that draws from ``rng`` and looks up ε at every step; arguments as for `EpsilonGreedy`.
 

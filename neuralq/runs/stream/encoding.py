@@ -20,13 +20,13 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import Space, spaces
 
+from neuralq.types import Array
 
 __all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "discrete_actions", "encoder_for"]
 
 MAX_TABLE_STATES = 10_000_000
 """The most states that a table is built for; beyond it a table is no longer the right representation."""
 
-_Array = np.ndarray[Any, np.dtype[Any]]
 _FLOAT, _WHOLE, _BINARY, _FRAMES = "f", "iu", "biu", (np.uint8, np.bool_)
 _KIND_WORDS = {_FLOAT: "floating-point", _WHOLE: "whole-number", _BINARY: "0/1", "b": "boolean"}
 
@@ -56,7 +56,7 @@ class ObservationError(ValueError):
         return f"{where}{self.field} {self.problem}"
 
 
-def _nothing() -> _Array:
+def _nothing() -> Array:
     return np.empty(0, np.int64)
 
 
@@ -73,9 +73,9 @@ class _Part:
     kinds: str
     dtype: np.dtype[Any]
     sizes: tuple[int, ...] | None  # categories per flattened entry; None for a Box
-    starts: _Array = field(default_factory=_nothing, compare=False, repr=False)
-    limits: _Array = field(default_factory=_nothing, compare=False, repr=False)
-    columns: _Array = field(default_factory=_nothing, compare=False, repr=False)
+    starts: Array = field(default_factory=_nothing, compare=False, repr=False)
+    limits: Array = field(default_factory=_nothing, compare=False, repr=False)
+    columns: Array = field(default_factory=_nothing, compare=False, repr=False)
 
     @property
     def width(self) -> int:
@@ -92,13 +92,15 @@ class _Part:
                 raise ObservationError(problem, field=_name(self.keys[:depth])) from None
         return observation
 
-    def read(self, batch: Any) -> _Array:
+    def read(self, batch: Any) -> Array:
         """This part of a batch as an array ``[N, *shape]`` of the right kind, not copied."""
         value = self.find(batch) if self.keys else batch
         array = value if type(value) is np.ndarray else _as_array(value, self.keys)
         if array.shape[1:] != self.shape or array.ndim == 0:
             shape = ", ".join(["N", *map(str, self.shape)])
-            way_out = "; one observation without its environment goes to encode_single" if array.shape == self.shape else ""
+            way_out = (
+                "; one observation without its environment goes to encode_single" if array.shape == self.shape else ""
+            )
             raise ObservationError(
                 f"must have shape [{shape}], got {list(array.shape)}{way_out}", field=_name(self.keys)
             )
@@ -109,7 +111,7 @@ class _Part:
             raise ObservationError(f"must be {wanted}, got dtype {array.dtype}; {way_out}", field=_name(self.keys))
         return array
 
-    def floats(self, batch: Any) -> _Array:
+    def floats(self, batch: Any) -> Array:
         """A fresh float32 copy ``[N, *shape]`` of a Box part, finite throughout."""
         array = self.read(batch)
         if array.dtype == np.float32:
@@ -121,14 +123,14 @@ class _Part:
             self._refuse_not_finite(array, copy)
         return copy
 
-    def _refuse_not_finite(self, array: _Array, copy: _Array) -> None:
+    def _refuse_not_finite(self, array: Array, copy: Array) -> None:
         env_index, *inner = (int(i) for i in np.argwhere(~np.isfinite(copy))[0])
         got = float(array[(env_index, *inner)])
         place = f" at index {tuple(inner)}" if inner else ""
         beyond = " (beyond the range of float32)" if math.isfinite(got) else ""
         raise ObservationError(f"must be finite, got {got!r}{place}{beyond}", env_index, _name(self.keys))
 
-    def digits(self, batch: Any) -> _Array:
+    def digits(self, batch: Any) -> Array:
         """The entries of a discrete part counted from zero, int64 ``[N, number of entries]``, each within its range."""
         array = self.read(batch)
         digits = array.astype(np.int64).reshape(len(array), len(self.sizes or ())) - self.starts
@@ -140,7 +142,7 @@ class _Part:
             raise ObservationError(f"must lie in {low}..{low + limit - 1}, {got}", env_index, _name(self.keys))
         return digits
 
-    def write(self, batch: Any, out: _Array) -> None:
+    def write(self, batch: Any, out: Array) -> None:
         """Fill ``out [N, width]`` (zeros) with this part: values, bits or one-hot blocks."""
         if self.sizes is None:
             out[:] = self.floats(batch).reshape(out.shape)
@@ -168,7 +170,7 @@ class Encoder:
     _layout: Literal["array", "image", "vector", "index"]
     _parts: tuple[_Part, ...]
 
-    def encode(self, batched_observation: Any) -> _Array:
+    def encode(self, batched_observation: Any) -> Array:
         """A fresh array ``[N, *shape]`` of the batch of N observations.
 
         Raises:
@@ -194,7 +196,7 @@ class Encoder:
             offset += part.width
         return out
 
-    def encode_single(self, observation: Any, env_index: int = 0) -> _Array:
+    def encode_single(self, observation: Any, env_index: int = 0) -> Array:
         """A fresh array ``[*shape]`` of one observation without an environment axis; ``environment`` is only for the error message.
 
         Raises:
@@ -209,10 +211,10 @@ class Encoder:
             encoded = self.encode(_add_env_axis(observation) if nested else _as_array(observation)[None])
         except ObservationError as error:
             raise ObservationError(error.problem, env_index, error.field) from None
-        row: _Array = encoded[0]
+        row: Array = encoded[0]
         return row if row.shape else np.array(row)
 
-    def _index(self, batch: Any) -> _Array:
+    def _index(self, batch: Any) -> Array:
         index = np.zeros(self._num_envs(batch), np.int64)
         for part in self._parts:  # Horner's rule
             digits = part.digits(batch)
@@ -289,7 +291,7 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]
 
 
 def _discrete_part(
-    keys: tuple[int | str, ...], shape: tuple[int, ...], kinds: str, space: Space[Any], sizes: _Array, starts: _Array
+    keys: tuple[int | str, ...], shape: tuple[int, ...], kinds: str, space: Space[Any], sizes: Array, starts: Array
 ) -> _Part:
     limits = sizes.astype(np.int64)
     columns = np.cumsum(limits) - limits
@@ -311,7 +313,7 @@ def _count_states(space: Space[Any], parts: tuple[_Part, ...]) -> int:
     return num_states
 
 
-def _as_array(value: Any, keys: tuple[int | str, ...] = ()) -> _Array:
+def _as_array(value: Any, keys: tuple[int | str, ...] = ()) -> Array:
     if isinstance(value, Mapping):
         raise ObservationError(f"must be an array, got {_describe(value)}", field=_name(keys))
     try:

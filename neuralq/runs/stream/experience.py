@@ -15,13 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq.runs.stream import ObservationSpec, Step
 from neuralq.learners.replay.buffer import ReplayBuffer
-from neuralq.types import Transition
+from neuralq.runs.stream import ObservationSpec, Step
+from neuralq.types import Array, Transition
 
 __all__ = ["Feed", "StepExperience", "ReplayExperience", "RolloutExperience", "Sample"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +34,7 @@ class Sample:
 
     transition: Transition
     weight: Tensor | None = None
-    indices: _Array | None = None
+    indices: Array | None = None
 
 
 class ExperienceSource(Protocol):
@@ -76,7 +74,7 @@ class _Rows:
 
     def __init__(self, num_steps: int, num_envs: int, spec: ObservationSpec) -> None:
         lead = (num_steps, num_envs)
-        self.fields: tuple[_Array, ...] = (
+        self.fields: tuple[Array, ...] = (
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.zeros(lead, np.int64),
             np.ones(lead, np.float32),

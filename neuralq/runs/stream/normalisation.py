@@ -16,15 +16,15 @@ import numpy as np
 
 from neuralq.checks import check_discount, check_whole
 from neuralq.jit import kernel
+from neuralq.types import Array
 
 __all__ = ["Normalisation"]
 
-_Array = np.ndarray[Any, np.dtype[Any]]
 _EPSILON = 1e-8
 
 
 @kernel
-def _learn(x: _Array, env_indices: _Array, count: _Array, mean: _Array, squares: _Array) -> None:
+def _learn(x: Array, env_indices: Array, count: Array, mean: Array, squares: Array) -> None:
     """Welford's update with the rows ``environments`` of ``x [N, d]``, one after another."""
     for env_index in env_indices:
         count[0] += 1
@@ -35,7 +35,7 @@ def _learn(x: _Array, env_indices: _Array, count: _Array, mean: _Array, squares:
 
 
 @kernel
-def _scaled(x: _Array, count: _Array, mean: _Array, squares: _Array, out: _Array) -> None:
+def _scaled(x: Array, count: Array, mean: Array, squares: Array, out: Array) -> None:
     for j in range(mean.size):
         var = squares[j] / (count[0] - 1) if count[0] > 1 else 1.0
         inv = 1.0 / np.sqrt(var + _EPSILON)
@@ -45,8 +45,8 @@ def _scaled(x: _Array, count: _Array, mean: _Array, squares: _Array, out: _Array
 
 @kernel
 def _accumulate(
-    r_t: _Array, last_t: _Array, moved: _Array, discount: float, u: _Array, count: _Array, mean: _Array,
-    squares: _Array, out: _Array,
+    r_t: Array, last_t: Array, moved: Array, discount: float, u: Array, count: Array, mean: Array,
+    squares: Array, out: Array,
 ) -> None:  # fmt: skip
     for env_index in range(r_t.size):
         if moved[env_index]:
@@ -102,7 +102,7 @@ class Normalisation:
         view._state, view._size, view._learning = self._state, self._size, False
         return view
 
-    def observe(self, x: _Array, env_indices: _Array | None = None) -> _Array:
+    def observe(self, x: Array, env_indices: Array | None = None) -> Array:
         """Learn from the rows ``environments`` (all if None) and return all rows normalised, ``[N, *shape]`` float32."""
         if not self.observations:
             return x
@@ -115,7 +115,7 @@ class Normalisation:
         _scaled(rows, *stats, out)
         return out.reshape(x.shape)
 
-    def scaling(self) -> tuple[_Array, _Array] | None:
+    def scaling(self) -> tuple[Array, Array] | None:
         """Mean and inverse spread of the observations so far, each ``[d]``: they are seen as (s − mean) · inverse.
 
         None where observations are not normalised.
@@ -124,7 +124,7 @@ class Normalisation:
         var = squares / (count - 1) if count > 1 else np.ones(self._size)
         return (self._state["observation_mean"].copy(), 1.0 / np.sqrt(var + _EPSILON)) if self.observations else None
 
-    def reward(self, r_t: _Array, last_t: _Array, moved: _Array) -> _Array:
+    def reward(self, r_t: Array, last_t: Array, moved: Array) -> Array:
         """Rewards ``[N]`` over the spread of discounted sums; environments that did not move teach nothing."""
         if not self.rewards or not self._learning:
             return r_t

@@ -13,13 +13,11 @@ from torch import Tensor
 
 from neuralq.checks import check_discount
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
-from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
 from neuralq.runs.stream.normalisation import Normalisation
-from neuralq.types import Transition
+from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
+from neuralq.types import Array, Transition
 
 __all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
-
-_Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Policy(Protocol):
@@ -78,8 +76,8 @@ class Step(NamedTuple):
         episodes: those that ended with this step.
     """
 
-    rows: tuple[_Array, ...]
-    env_indices: _Array
+    rows: tuple[Array, ...]
+    env_indices: Array
     episodes: tuple[Episode, ...]
 
     @property
@@ -129,7 +127,7 @@ class Interaction:
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, np.int64)
         self._pending = np.zeros(self.num_envs, bool)
-        self._mask: _Array | None = None
+        self._mask: Array | None = None
         self._begun = False
         self.restart(seed)
         self._begun = True
@@ -156,7 +154,9 @@ class Interaction:
         self._lengths[:] = 0
         self._s = self._observe(observation, info, self._everyone)
 
-    def _observe(self, observation: Any, info: Mapping[str, Any], env_indices: _Array, over: _Array | None = None) -> _Array:
+    def _observe(
+        self, observation: Any, info: Mapping[str, Any], env_indices: Array, over: Array | None = None
+    ) -> Array:
         """Encode a batch, with the action mask of ``environments`` appended where the environment gives one.
 
         Where ``over`` is true the world has ended, and there may be no legal action.
@@ -176,7 +176,7 @@ class Interaction:
         self._mask[env_indices] = self._legal(info, env_indices, over)
         return self._with_mask(encoded)
 
-    def _legal(self, info: Mapping[str, Any], env_indices: _Array, over: _Array | None) -> _Array:
+    def _legal(self, info: Mapping[str, Any], env_indices: Array, over: Array | None) -> Array:
         """The masks of ``environments``, ``[k, A]`` bool; an environment without one may do everything."""
         legal = np.ones((len(env_indices), self.num_actions), bool)
         given, held = info.get("action_mask"), info.get("_action_mask")
@@ -193,15 +193,19 @@ class Interaction:
             legal[rows] = np.asarray(masks) != 0
         for row in np.flatnonzero(~legal.any(-1)):
             if over is None or not over[env_indices[row]]:
-                raise self._mask_fault(env_indices[row], "must allow an action until the episode has terminated, allows none")
+                raise self._mask_fault(
+                    env_indices[row], "must allow an action until the episode has terminated, allows none"
+                )
             legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
         return legal
 
     def _mask_fault(self, env_index: int, problem: str) -> EnvironmentFault:
         step = self._lengths[env_index] + 1
-        return self._fault(f"environment {environment}, step {step} of its episode, field info['action_mask']: {problem}")
+        return self._fault(
+            f"environment {environment}, step {step} of its episode, field info['action_mask']: {problem}"
+        )
 
-    def _with_mask(self, encoded: _Array) -> _Array:
+    def _with_mask(self, encoded: Array) -> Array:
         assert self._mask is not None
         flat = encoded.reshape(len(encoded), -1)
         return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
@@ -238,7 +242,7 @@ class Interaction:
         everyone = np.count_nonzero(fake) == 0
         env_indices = self._everyone if everyone else np.flatnonzero(~fake)
         discount_t = np.where(terminated, 0.0, self.discount) if ended else self._discounts.copy()
-        rows: tuple[_Array, ...] = (self._s, chosen, mu, r_t, discount_t, s_t, last)
+        rows: tuple[Array, ...] = (self._s, chosen, mu, r_t, discount_t, s_t, last)
         if self.normalisation is not None:
             rows = (*rows[:3], self.normalisation.reward(r_t, last, ~fake), *rows[4:])
         if not everyone:
@@ -254,7 +258,7 @@ class Interaction:
             self._s = arrived
         return Step(rows, env_indices, episodes)
 
-    def _checked_reward(self, reward: Any) -> _Array:
+    def _checked_reward(self, reward: Any) -> Array:
         try:
             r_t = np.array(reward, np.float64)
         except (TypeError, ValueError) as error:
@@ -269,7 +273,7 @@ class Interaction:
             )
         return r_t
 
-    def _true_successors(self, arrived: _Array, last: _Array, terminated: _Array, info: Mapping[str, Any]) -> _Array:
+    def _true_successors(self, arrived: Array, last: Array, terminated: Array, info: Mapping[str, Any]) -> Array:
         """Under SAME_STEP, what the finished episodes really arrived at."""
         successors = arrived.copy()
         rows = successors.reshape(self.num_envs, -1)  # a view
@@ -286,7 +290,7 @@ class Interaction:
             successors[ended, -self.num_actions :] = self._legal(info.get("final_info", {}), ended, terminated)
         return successors
 
-    def _finish(self, last: _Array, arrived: _Array) -> tuple[Episode, ...]:
+    def _finish(self, last: Array, arrived: Array) -> tuple[Episode, ...]:
         """Account for the finished episodes and, where restarting is ours, restart those environments."""
         ended = np.flatnonzero(last)
         episodes = tuple(Episode(int(i), float(self._returns[i]), int(self._lengths[i])) for i in ended)
@@ -334,7 +338,7 @@ class Interaction:
             self.normalisation.load_state_dict(state["normalisation"])
 
 
-def _act(policy: Policy, s: _Array) -> tuple[_Array, _Array]:
+def _act(policy: Policy, s: Array) -> tuple[Array, Array]:
     on_arrays = getattr(policy, "on_arrays", None)
     if on_arrays is not None:
         return on_arrays(s)  # type: ignore[no-any-return]

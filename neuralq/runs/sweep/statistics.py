@@ -15,13 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from neuralq.checks import check_fraction, check_whole
+from neuralq.types import Floats
 
 __all__ = ["Estimate", "bootstrap_interval", "estimate", "interquartile_mean"]
 
-_Array = NDArray[np.float64]
 _MOST_DRAWN = 4_000_000  # scores held at once while resampling: 32 MB
 
 
@@ -42,7 +42,7 @@ class Estimate:
     num_runs: int
 
 
-def interquartile_mean(scores: ArrayLike, axis: int = -1) -> _Array:
+def interquartile_mean(scores: ArrayLike, axis: int = -1) -> Floats:
     """The mean of the middle half: ⌊n/4⌋ scores are dropped at each end and the others averaged.
 
     Args:
@@ -66,13 +66,13 @@ def interquartile_mean(scores: ArrayLike, axis: int = -1) -> _Array:
     if num_scores == 0:
         raise ValueError("an interquartile mean needs at least one score, got none")
     cut = num_scores // 4
-    mean: _Array = np.mean(ordered[..., cut : num_scores - cut], axis=-1)
+    mean: Floats = np.mean(ordered[..., cut : num_scores - cut], axis=-1)
     return mean
 
 
 def bootstrap_interval(
     scores: ArrayLike, rng: np.random.Generator, confidence: float = 0.95, num_resamples: int = 10_000
-) -> tuple[_Array, _Array]:
+) -> tuple[Floats, Floats]:
     """Percentile interval of the interquartile mean over all runs and tasks, the runs of each task drawn by themselves.
 
     Args:

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from neuralq.checks import check_choice
 from neuralq.systems.backgammon.network import ValueNetwork, equities
 from neuralq.systems.backgammon.search import MAX_CANDIDATES, WINDOW, look_ahead
+from neuralq.types import Floats
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.position import check_dice
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, Board, afterstates, result
 
 __all__ = ["BackgammonAgent", "Chances", "RankedTurn"]
-
-_Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +130,7 @@ class BackgammonAgent:
             for i in order[:num_turns]
         ]
 
-    def _look_into(self, boards: Board, y: _Array, others: _Array, order: NDArray[np.intp]) -> NDArray[np.intp]:
+    def _look_into(self, boards: Board, y: Floats, others: Floats, order: NDArray[np.intp]) -> NDArray[np.intp]:
         """Puts what two plies say of the best into ``y`` and ``others``, and returns the new order."""
         net, best = self.network, order[:MAX_CANDIDATES]
         best = best[others[best] <= others[order[0]] + WINDOW]

@@ -29,13 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import lean_kernel, lean_reassociating_kernel
+from neuralq.types import Array
 from neuralq_envs.backgammon.expert import NUM_EXPERT, expert_inputs
 from neuralq_envs.backgammon.inputs import MAX_ACTIVE, NUM_INPUTS, tesauro_sparse
 from neuralq_envs.backgammon.rules import BAR, MAX_AFTERSTATES, Board, result
 
 __all__ = ["Scratch", "choose", "equity_of", "evaluate", "forward", "new_scratch", "settled"]
 
-_Array = NDArray[Any]
 
 _OTHER = 98  # where the inputs of the side that is not to move begin
 
@@ -45,12 +45,12 @@ class Scratch(NamedTuple):
 
     boards: Board  # [MAX_AFTERSTATES, 2, 25]
     indices: NDArray[np.int64]  # [46]
-    inputs: _Array  # [46]
-    expert: _Array  # [14]
-    first: _Array  # [H] Wᵀx of the first afterstate
-    hidden: _Array  # [H]
-    y: _Array  # [K]
-    back: _Array  # [K, H]
+    inputs: Array  # [46]
+    expert: Array  # [14]
+    first: Array  # [H] Wᵀx of the first afterstate
+    hidden: Array  # [H]
+    y: Array  # [K]
+    back: Array  # [K, H]
 
 
 def new_scratch(num_hidden: int, num_outputs: int, dtype: Any) -> Scratch:
@@ -73,7 +73,7 @@ def new_scratch(num_hidden: int, num_outputs: int, dtype: Any) -> Scratch:
 
 
 @lean_reassociating_kernel
-def _sigmoids(z: _Array) -> None:
+def _sigmoids(z: Array) -> None:
     """σ(z) in place."""
     one = z.dtype.type(1.0)
     if z.itemsize == 8:
@@ -94,7 +94,7 @@ def _sigmoids(z: _Array) -> None:
 
 
 @lean_reassociating_kernel
-def _outputs(v: _Array, c: _Array, hidden: _Array, y: _Array) -> None:
+def _outputs(v: Array, c: Array, hidden: Array, y: Array) -> None:
     for k in range(y.size):
         total = c[k]
         for j in range(hidden.size):
@@ -104,7 +104,7 @@ def _outputs(v: _Array, c: _Array, hidden: _Array, y: _Array) -> None:
 
 
 @lean_reassociating_kernel
-def _sum_of_inputs(board: Board, w: _Array, indices: NDArray[np.int64], inputs: _Array, z: _Array) -> int:
+def _sum_of_inputs(board: Board, w: Array, indices: NDArray[np.int64], inputs: Array, z: Array) -> int:
     """Wᵀx, from the inputs that are not zero; they and their numbers are written too."""
     count = tesauro_sparse(board, 0, indices, inputs)
     indices[count] = NUM_INPUTS
@@ -119,7 +119,7 @@ def _sum_of_inputs(board: Board, w: _Array, indices: NDArray[np.int64], inputs: 
 
 
 @lean_kernel
-def _with_expert(board: Board, w: _Array, count: int, s: Scratch, z: _Array) -> int:
+def _with_expert(board: Board, w: Array, count: int, s: Scratch, z: Array) -> int:
     """Adds what the expert inputs give to z, if the network has them; writes them behind the ``count`` others."""
     if len(w) == NUM_INPUTS + 1:
         return count
@@ -133,13 +133,13 @@ def _with_expert(board: Board, w: _Array, count: int, s: Scratch, z: _Array) -> 
 
 
 @lean_reassociating_kernel
-def _add_row(w: _Array, row: int, x: Any, z: _Array) -> None:
+def _add_row(w: Array, row: int, x: Any, z: Array) -> None:
     for j in range(z.size):
         z[j] += x * w[row, j]
 
 
 @lean_reassociating_kernel
-def _change(before: Board, boards: Board, i: int, w: _Array, z: _Array) -> int:
+def _change(before: Board, boards: Board, i: int, w: Array, z: Array) -> int:
     """Adds to z what Wᵀx of ``boards[i]`` has beyond that of ``before``; says how many checkers row 1 has left."""
     one = z.dtype.type(1.0)
     left = 0
@@ -168,7 +168,7 @@ def _change(before: Board, boards: Board, i: int, w: _Array, z: _Array) -> int:
 
 
 @lean_kernel
-def equity_of(y: _Array) -> float:
+def equity_of(y: Array) -> float:
     """Points that the side to move expects: Σₖ (k + 1)(yₖ − yₖ₊ₘ), m = K/2 kinds of a win, or 2y₀ − 1 where K = 1."""
     kinds, equity = y.size // 2, 0.0
     if kinds == 0:
@@ -179,7 +179,7 @@ def equity_of(y: _Array) -> float:
 
 
 @lean_reassociating_kernel
-def settled(points: int, y: _Array) -> None:
+def settled(points: int, y: Array) -> None:
     """The outputs of a game that is over, ``points`` being what the side to move has won."""
     for k in range(y.size):
         y[k] = 0.0
@@ -191,7 +191,7 @@ def settled(points: int, y: _Array) -> None:
 
 
 @lean_kernel
-def choose(count: int, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
+def choose(count: int, w: Array, v: Array, c: Array, s: Scratch) -> int:
     """Which of the first ``count`` afterstates in ``s.boards`` is worst for the side that is then to move."""
     best, lowest = 0, np.inf
     _sum_of_inputs(s.boards[0], w, s.indices, s.inputs, s.first)
@@ -212,7 +212,7 @@ def choose(count: int, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
 
 
 @lean_kernel
-def forward(board: Board, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
+def forward(board: Board, w: Array, v: Array, c: Array, s: Scratch) -> int:
     """Writes the hidden units and the outputs, and the inputs that are not zero; returns how many these are."""
     count = _sum_of_inputs(board, w, s.indices, s.inputs, s.hidden)
     count = _with_expert(board, w, count, s, s.hidden)
@@ -222,7 +222,7 @@ def forward(board: Board, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
 
 
 @lean_kernel
-def evaluate(boards: Board, w: _Array, v: _Array, c: _Array, s: Scratch, y: _Array) -> None:
+def evaluate(boards: Board, w: Array, v: Array, c: Array, s: Scratch, y: Array) -> None:
     """Writes the outputs of each board: what the network says, or what has happened where the game is over.
 
     Args:

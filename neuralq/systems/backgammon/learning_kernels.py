@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 
 from neuralq.jit import kernel, lean_kernel, lean_reassociating_kernel
 from neuralq.systems.backgammon.kernels import Scratch, choose, forward, settled
+from neuralq.types import Array
 from neuralq_envs.backgammon.rules import START, Board, afterstates, copy_board, result, roll
 
 __all__ = ["play_batch", "play_online"]
 
-_Array = NDArray[Any]
 
 _NEGLIGIBLE = 1e-12
 _FIRST_HISTORY = 512
 
 
 @kernel
-def _turn(board: Board, opening: bool, rng: np.random.Generator, w: _Array, v: _Array, c: _Array, s: Scratch) -> None:
+def _turn(board: Board, opening: bool, rng: np.random.Generator, w: Array, v: Array, c: Array, s: Scratch) -> None:
     """Rolls and plays the best turn, in place: the board is then seen by the other side."""
     die_1, die_2 = roll(rng, opening)
     count = afterstates(board, die_1, die_2, s.boards)
@@ -43,7 +43,7 @@ def _tally(points: int, turns: int, tally: NDArray[np.int64]) -> None:
 
 
 @lean_reassociating_kernel
-def _backward(v: _Array, s: Scratch, sign: Any) -> None:
+def _backward(v: Array, s: Scratch, sign: Any) -> None:
     """∂y[k]/∂z into s.back ``[K, H]`` for z = Wᵀx, times ``sign``; s.hidden and s.y are the values."""
     one = s.y.dtype.type(1.0)
     for k in range(s.y.size):
@@ -53,7 +53,7 @@ def _backward(v: _Array, s: Scratch, sign: Any) -> None:
 
 
 @lean_kernel
-def _seen_by_first(y: _Array, first_moves: bool, out: _Array) -> None:
+def _seen_by_first(y: Array, first_moves: bool, out: Array) -> None:
     """The outputs as the player who moved first sees them."""
     if y.size == 1:
         out[0] = y[0] if first_moves else y.dtype.type(1.0) - y[0]
@@ -64,8 +64,8 @@ def _seen_by_first(y: _Array, first_moves: bool, out: _Array) -> None:
 
 @lean_reassociating_kernel
 def _learn(
-    w: _Array, v: _Array, c: _Array, zw: _Array, zv: _Array, zc: _Array,
-    step: _Array, decay: Any, rows: NDArray[np.int64], ages: NDArray[np.int64], num_rows: int, oldest: int,
+    w: Array, v: Array, c: Array, zw: Array, zv: Array, zc: Array,
+    step: Array, decay: Any, rows: NDArray[np.int64], ages: NDArray[np.int64], num_rows: int, oldest: int,
 ) -> int:  # fmt: skip
     """θ ← θ + Σₖ stepₖ zₖ, then z ← decay · z, in one pass; drops rows too old, returns how many are left."""
     num_outputs, num_hidden = step.size, w.shape[1]
@@ -101,7 +101,7 @@ def _learn(
 
 @lean_reassociating_kernel
 def _remember(
-    s: Scratch, count: int, first_moves: bool, sign: Any, zw: _Array, zv: _Array, zc: _Array,
+    s: Scratch, count: int, first_moves: bool, sign: Any, zw: Array, zv: Array, zc: Array,
     rows: NDArray[np.int64], ages: NDArray[np.int64], num_rows: int,
 ) -> int:  # fmt: skip
     """Adds ∇y to the trace, the outputs being those the first player sees; returns how many rows of zw are not zero."""
@@ -126,7 +126,7 @@ def _remember(
 
 
 @lean_kernel
-def _forget(zw: _Array, zv: _Array, zc: _Array, ages: NDArray[np.int64]) -> None:
+def _forget(zw: Array, zv: Array, zc: Array, ages: NDArray[np.int64]) -> None:
     for i in range(len(ages)):
         ages[i] = -1
         for k in range(zw.shape[1]):
@@ -150,7 +150,7 @@ def _oldest_trace(lambda_: float) -> int:
 @kernel
 def play_online(
     rates: NDArray[np.float64], lambdas: NDArray[np.float64], rng: np.random.Generator,
-    w: _Array, v: _Array, c: _Array, s: Scratch, tally: NDArray[np.int64],
+    w: Array, v: Array, c: Array, s: Scratch, tally: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Plays ``len(rates)`` games against itself, learning after every turn: Tesauro's TD(λ), backward view.
 
@@ -207,8 +207,8 @@ def play_online(
 
 @kernel
 def play_batch(
-    num_games: int, lambda_: float, rng: np.random.Generator, w: _Array, v: _Array, c: _Array,
-    gw: _Array, gv: _Array, gc: _Array, s: Scratch, tally: NDArray[np.int64],
+    num_games: int, lambda_: float, rng: np.random.Generator, w: Array, v: Array, c: Array,
+    gw: Array, gv: Array, gc: Array, s: Scratch, tally: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Plays games against itself with fixed weights, and sums what TD(λ) would have them change: the forward view.
 
@@ -263,7 +263,7 @@ def play_batch(
 
 
 @lean_kernel
-def _turn_around(y: _Array) -> None:
+def _turn_around(y: Array) -> None:
     """The outputs as the other side sees them, in place."""
     kinds = y.size // 2
     if kinds == 0:
@@ -273,9 +273,7 @@ def _turn_around(y: _Array) -> None:
 
 
 @lean_reassociating_kernel
-def _add_gradient(
-    v: _Array, s: Scratch, count: int, error: _Array, back: _Array, gw: _Array, gv: _Array, gc: _Array
-) -> None:
+def _add_gradient(v: Array, s: Scratch, count: int, error: Array, back: Array, gw: Array, gv: Array, gc: Array) -> None:
     """Adds Σₖ errorₖ ∇yₖ."""
     one = s.y.dtype.type(1.0)
     for j in range(back.size):

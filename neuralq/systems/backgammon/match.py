@@ -30,6 +30,7 @@ from neuralq.systems.backgammon.kernels import Scratch, choose
 from neuralq.systems.backgammon.network import ValueNetwork
 from neuralq.systems.backgammon.opponents import GnubgPlayer, require_gnubg
 from neuralq.systems.backgammon.search import choose_two_ply
+from neuralq.types import Array
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, Board, afterstates, copy_board, result, roll
 
 __all__ = ["OPPONENTS", "MatchResult", "Player", "Side", "play_match", "rolls", "turn_taker"]
@@ -39,7 +40,6 @@ Player: TypeAlias = "str | BackgammonAgent | ValueNetwork"
 
 OPPONENTS = ("random", "pubeval", "gnubg")
 
-_Array = NDArray[Any]
 _BLOCK = 50  # games that a worker plays in one go
 
 
@@ -317,7 +317,7 @@ def rolls(dice: np.random.Generator) -> Iterator[tuple[int, int]]:
 
 @kernel
 def _take_turn(
-    board: Board, die_1: int, die_2: int, plies: int, lot: float, w: _Array, v: _Array, c: _Array, s: Scratch
+    board: Board, die_1: int, die_2: int, plies: int, lot: float, w: Array, v: Array, c: Array, s: Scratch
 ) -> None:
     """In place; plies of 0 stand for a player that draws lots, and then ``lot`` in [0, 1) is what it has drawn."""
     count = afterstates(board, die_1, die_2, s.boards)
@@ -335,7 +335,7 @@ def _take_turn(
 @kernel
 def _play_game(
     first: int, dice: np.random.Generator, choices: np.random.Generator, plies_0: int, plies_1: int,
-    w0: _Array, v0: _Array, c0: _Array, s0: Scratch, w1: _Array, v1: _Array, c1: _Array, s1: Scratch,
+    w0: Array, v0: Array, c0: Array, s0: Scratch, w1: Array, v1: Array, c1: Array, s1: Scratch,
 ) -> tuple[int, int]:  # fmt: skip
     """Points of side 0, and turns."""
     board = START.copy()

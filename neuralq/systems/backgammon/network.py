@@ -13,13 +13,12 @@ from safetensors.numpy import save_file
 
 from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.systems.backgammon.kernels import choose, evaluate, new_scratch
+from neuralq.types import Array
 from neuralq_envs.backgammon.expert import NUM_EXPERT
 from neuralq_envs.backgammon.inputs import NUM_INPUTS
 from neuralq_envs.backgammon.rules import Board, afterstates
 
 __all__ = ["ValueNetwork", "equities"]
-
-_Array = NDArray[Any]
 
 
 class ValueNetwork:
@@ -52,10 +51,10 @@ class ValueNetwork:
         check_choice("dtype", self.dtype.name, ("float32", "float64"))
         num_rows = NUM_INPUTS + 1 + (NUM_EXPERT if expert else 0)
         sizes = np.cumsum([num_rows * num_hidden, num_outputs * num_hidden, num_outputs])
-        self.flat: _Array = np.zeros(sizes[-1], self.dtype)
-        self.w: _Array = self.flat[: sizes[0]].reshape(num_rows, num_hidden)
-        self.v: _Array = self.flat[sizes[0] : sizes[1]].reshape(num_outputs, num_hidden)
-        self.c: _Array = self.flat[sizes[1] :]
+        self.flat: Array = np.zeros(sizes[-1], self.dtype)
+        self.w: Array = self.flat[: sizes[0]].reshape(num_rows, num_hidden)
+        self.v: Array = self.flat[sizes[0] : sizes[1]].reshape(num_outputs, num_hidden)
+        self.c: Array = self.flat[sizes[1] :]
         self.scratch = new_scratch(num_hidden, num_outputs, self.dtype)
 
     @classmethod
@@ -96,7 +95,7 @@ class ValueNetwork:
         """Whether it is shown more than Tesauro's inputs."""
         return len(self.w) > NUM_INPUTS + 1
 
-    def outputs(self, boards: Board) -> _Array:
+    def outputs(self, boards: Board) -> Array:
         """Chances ``[n, K]`` of the sides to move in boards ``[n, 2, 25]``; certainties where the game is over."""
         y = np.empty((len(boards), self.num_outputs), self.dtype)
         evaluate(np.ascontiguousarray(boards, np.int8), self.w, self.v, self.c, self.scratch, y)
@@ -148,7 +147,7 @@ class ValueNetwork:
         return network
 
 
-def equities(y: _Array) -> NDArray[np.float64]:
+def equities(y: Array) -> NDArray[np.float64]:
     """Points that the side to move expects, from ``[..., K]``: Σₖ (k + 1)(yₖ − yₖ₊ₘ), m = K/2, or 2y₀ − 1 where K = 1.
 
     Example:

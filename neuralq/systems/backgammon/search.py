@@ -18,18 +18,16 @@ section 5.5, expectiminimax.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import kernel
 from neuralq.systems.backgammon.kernels import Scratch, choose, equity_of, evaluate
+from neuralq.types import Array
 from neuralq_envs.backgammon.rules import ROLL_PROBABILITIES, ROLLS, Board, afterstates, result
 
 __all__ = ["MAX_CANDIDATES", "WINDOW", "choose_two_ply", "look_ahead"]
 
-_Array = NDArray[Any]
 
 MAX_CANDIDATES = 8
 WINDOW = 0.16
@@ -39,7 +37,7 @@ _CHANCES = np.array(ROLL_PROBABILITIES)
 
 
 @kernel
-def look_ahead(board: Board, w: _Array, v: _Array, c: _Array, s: Scratch, ahead: NDArray[np.float64]) -> float:
+def look_ahead(board: Board, w: Array, v: Array, c: Array, s: Scratch, ahead: NDArray[np.float64]) -> float:
     """What the side that has just moved expects of the board it leaves, at two plies; the game is not over.
 
     Args:
@@ -65,7 +63,7 @@ def look_ahead(board: Board, w: _Array, v: _Array, c: _Array, s: Scratch, ahead:
 
 
 @kernel
-def choose_two_ply(count: int, w: _Array, v: _Array, c: _Array, s: Scratch) -> int:
+def choose_two_ply(count: int, w: Array, v: Array, c: Array, s: Scratch) -> int:
     """Which of the first ``count`` afterstates in ``s.boards`` is best for the side that leaves it, at two plies.
 
     ``s.boards`` is overwritten from its beginning, but not the board that was chosen: that is written to its place.
