@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from neuralq import rules
-from neuralq.runs.stream.acting import choose_epsilon_greedy, choose_greedy, epsilon_greedy_policy
+from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_epsilon_greedy, choose_greedy
 
 INF = math.inf
 
@@ -97,7 +97,7 @@ def test_unusable_values_are_refused_with_their_row() -> None:
 
 def test_the_policy_draws_from_its_generator_and_looks_epsilon_up_at_each_step() -> None:
     epsilons = iter([0.0, 1.0])
-    policy = epsilon_greedy_policy(lambda s: -s, lambda: next(epsilons), np.random.default_rng(5))
+    policy = EpsilonGreedyPolicy(lambda s: -s, lambda: next(epsilons), np.random.default_rng(5))
     s = torch.tensor([[0.0, 1.0, 2.0]]).expand(8, 3)
     own = np.random.default_rng(5)
     for epsilon in (0.0, 1.0):

@@ -24,7 +24,7 @@ from neuralq.q import MLP, ActionInputQ, ActionOutputQ, MaskedQ, SeparateQ, Tabl
 from neuralq.q.engine import Loss, MlpEngine, TorchEngine, array_values, make_engine, on_arrays
 from neuralq.q.inputs import OneHot
 from neuralq.runs.stream import Interaction
-from neuralq.runs.stream.acting import epsilon_greedy_policy
+from neuralq.runs.stream.acting import EpsilonGreedyPolicy
 from neuralq.types import Transition
 
 DTYPES = (torch.float32, torch.float64)
@@ -94,7 +94,7 @@ def test_a_policy_on_arrays_takes_the_actions_of_the_one_on_tensors() -> None:
     seen = []
     for values in (None, array_values(engine)):
         epsilons = iter(np.linspace(1, 0, 300))
-        policy = epsilon_greedy_policy(engine.all, lambda e=epsilons: next(e), np.random.default_rng(7), values)
+        policy = EpsilonGreedyPolicy(engine.all, lambda e=epsilons: next(e), np.random.default_rng(7), values)
         assert (policy.on_arrays is None) == (values is None)
         stream = Interaction(gymnasium.make_vec("CartPole-v1", num_envs=3), 0.9, seed=5)
         seen.append([stream.step(policy) for _ in range(300)])

@@ -180,7 +180,7 @@ NESTED = spaces.Dict({"speed": spaces.Box(-1, 1, (2,)), "gear": spaces.Tuple((sp
 
 
 @pytest.mark.parametrize(
-    ("space", "batch", "environment", "field", "words"),
+    ("space", "batch", "env_index", "field", "words"),
     [
         (spaces.Box(-1, 1, (2,)), NAN, 1, "observation", r"finite, got nan at index \(1,\)"),
         (spaces.Box(-1, 1, ()), np.array([0, 0, -np.inf]), 2, "observation", "finite, got -inf$"),
@@ -198,11 +198,11 @@ NESTED = spaces.Dict({"speed": spaces.Box(-1, 1, (2,)), "gear": spaces.Tuple((sp
         (spaces.MultiBinary(2), np.array([[0, 1], [2, 0]]), 1, "observation", r"lie in 0\.\.1, got 2 at flat index 0"),
         (NESTED, {"speed": FLOATS}, None, "observation", r"dict holding 'gear', got dict of \['speed'\]"),
         (NESTED, {"gear": (), "speed": 0}, None, "observation['gear']", "tuple holding 0, got tuple"),
-        (NESTED, {"gear": (np.array([1]),), "speed": FLOATS}, None, "observation['speed']", "has 2 environments"),
+        (NESTED, {"gear": (np.array([1]),), "speed": FLOATS}, None, "observation['speed']", "has 2 rows"),
         (NESTED, {"gear": (np.array([1, 9]),), "speed": FLOATS}, 1, "observation['gear'][0]", "got 9"),
     ],
 )  # fmt: skip
-def test_refusals_name_lane_and_field(
+def test_refusals_name_environment_and_field(
     space: Space[Any], batch: Any, env_index: int | None, field: str, words: str
 ) -> None:
     with pytest.raises(ObservationError, match=words) as caught:
@@ -213,7 +213,7 @@ def test_refusals_name_lane_and_field(
     assert (str(again), again.env_index, again.field) == (str(caught.value), env_index, field)
 
 
-def test_single_observation_errors_name_the_lane_they_are_told() -> None:
+def test_single_observation_errors_name_the_environment_they_are_told() -> None:
     encoder = encoder_for(spaces.Box(-1, 1, (2,)))
     with pytest.raises(ObservationError, match=r"^environment 7: observation must be finite, got nan at index \(0,\)"):
         encoder.encode_single(np.array([np.nan, 0], np.float32), env_index=7)

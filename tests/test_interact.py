@@ -23,14 +23,14 @@ from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MaskedQ, TableQ
 from neuralq.runs.folder import encode_env, restore_env
 from neuralq.runs.stream import EnvironmentFault, Interaction, Step, interact, make_vector_env
-from neuralq.runs.stream.acting import epsilon_greedy_policy
+from neuralq.runs.stream.acting import EpsilonGreedyPolicy
 from neuralq.runs.stream.experience import ReplayExperience
 from neuralq.types import Transition
 
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
 GAMMA = 0.9
 NUM_ACTIONS = 3
-NUM_LANES = 3
+NUM_ENVS = 3
 # Length of each episode and how it ends; environment i begins with entry i.
 EPISODES = ((3, "terminated"), (1, "truncated"), (4, "truncated"), (1, "terminated"), (2, "both"))
 
@@ -128,18 +128,18 @@ def plain_loop(env: Scripted, num_steps: int) -> tuple[list[tuple[Any, ...]], li
 
 
 def stream_of(mode: AutoresetMode, **options: Any) -> Interaction:
-    envs = SyncVectorEnv([lambda i=i: Scripted(i, **options) for i in range(NUM_LANES)], autoreset_mode=mode)
+    envs = SyncVectorEnv([lambda i=i: Scripted(i, **options) for i in range(NUM_ENVS)], autoreset_mode=mode)
     return Interaction(envs, GAMMA, seed=0)
 
 
-def lanes_of(steps: list[Step]) -> list[list[tuple[Any, ...]]]:
-    env_indices: list[list[tuple[Any, ...]]] = [[] for _ in range(NUM_LANES)]
+def by_environment(steps: list[Step]) -> list[list[tuple[Any, ...]]]:
+    found: list[list[tuple[Any, ...]]] = [[] for _ in range(NUM_ENVS)]
     for step in steps:
         t = step.transition
         fields = (t.s_tm1, t.a_tm1, t.mu_tm1, t.r_t, t.discount_t, t.s_t, t.last_t)
         for row, env_index in enumerate(step.env_indices):
-            env_indices[env_index].append(tuple(field[row].numpy() for field in fields))
-    return env_indices
+            found[env_index].append(tuple(field[row].numpy() for field in fields))
+    return found
 
 
 def assert_same(got: list[tuple[Any, ...]], wanted: list[tuple[Any, ...]]) -> None:
@@ -162,11 +162,11 @@ OPTIONS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_every_lane_equals_a_plain_loop(mode: AutoresetMode, options: dict[str, Any]) -> None:
+def test_every_environment_equals_a_plain_loop(mode: AutoresetMode, options: dict[str, Any]) -> None:
     stream = stream_of(mode, **options)
     masked = bool(options.get("masked"))
     steps = [stream.step(policy_for(masked)) for _ in range(40)]
-    for env_index, got in enumerate(lanes_of(steps)):
+    for env_index, got in enumerate(by_environment(steps)):
         rows, episodes = plain_loop(Scripted(env_index, **options), len(got))
         assert len(got) >= 25
         assert_same(got, rows)
@@ -182,9 +182,9 @@ def test_replay_contents_are_the_same_in_all_modes(options: dict[str, Any]) -> N
     contents = []
     for mode in MODES:
         stream = stream_of(mode, **options)
-        buffer = ReplayBuffer(NUM_LANES * 24, stream.spec.shape, stream.spec.dtype, num_envs=NUM_LANES)
+        buffer = ReplayBuffer(NUM_ENVS * 24, stream.spec.shape, stream.spec.dtype, num_envs=NUM_ENVS)
         experience = ReplayExperience(buffer, np.random.default_rng(0), 8, 1, 10**6, 1, 1)
-        left = np.full(NUM_LANES, 24)
+        left = np.full(NUM_ENVS, 24)
         while left.any():  # stop each environment at the same number of steps: NEXT_STEP pauses, the others do not
             step = stream.step(policy_for(bool(options.get("masked"))))
             keep = left[step.env_indices] > 0
@@ -213,7 +213,9 @@ def flattened(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_truncation_keeps_the_bootstrap_and_termination_does_not() -> None:
-    rows = lanes_of([step for step, _ in zip(stream_of(MODES[0]).steps(policy_for(False)), range(20), strict=False)])[0]
+    rows = by_environment(
+        [step for step, _ in zip(stream_of(MODES[0]).steps(policy_for(False)), range(20), strict=False)]
+    )[0]
     ends = [(float(row[4]), bool(row[6])) for row in rows]
     on, end = (GAMMA, False), (0.0, True)
     assert ends[:11] == [on, on, end, (GAMMA, True), on, on, on, (GAMMA, True), end, on, end]
@@ -313,7 +315,7 @@ FAULTS = {
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_names_environment_time_and_field_and_ends_the_stream(mode: AutoresetMode, fault: str) -> None:
-    envs = SyncVectorEnv([lambda i=i: Faulty(i, fault) for i in range(NUM_LANES)], autoreset_mode=mode)
+    envs = SyncVectorEnv([lambda i=i: Faulty(i, fault) for i in range(NUM_ENVS)], autoreset_mode=mode)
     stream = Interaction(envs, GAMMA, 0)
     steps = 0
     with pytest.raises(EnvironmentFault, match=FAULTS[fault]) as caught:
@@ -397,7 +399,7 @@ def test_only_legal_actions_are_ever_taken_on_mitchells_grid(vectorised: bool) -
     spec = stream.spec
     assert (spec.masked, spec.shape, spec.inner_shape, spec.num_categories, spec.num_actions) == (True, (5,), (), 6, 4)
     q = MaskedQ(TableQ(6, 4), ())
-    policy = epsilon_greedy_policy(lambda s: q.all(s).detach(), lambda: 1.0, np.random.default_rng(0))
+    policy = EpsilonGreedyPolicy(lambda s: q.all(s).detach(), lambda: 1.0, np.random.default_rng(0))
     taken = set()
     for _ in range(150):
         step = stream.step(policy)
@@ -429,7 +431,7 @@ def test_a_restored_stream_continues_bit_for_bit(mode: AutoresetMode, masked: bo
     again.load_state_dict(state)
     got = [again.step(policy_for(masked)) for _ in range(12)]
     assert [step.episodes for step in got] == [step.episodes for step in wanted]
-    for ours, theirs in zip(lanes_of(got), lanes_of(wanted), strict=True):
+    for ours, theirs in zip(by_environment(got), by_environment(wanted), strict=True):
         assert_same(ours, theirs)
     assert again.num_steps == stream.num_steps
 
@@ -439,7 +441,7 @@ def test_interact_yields_the_transitions_of_the_stream() -> None:
         assert isinstance(rng, np.random.Generator)
         return policy_for(False)(s)
 
-    envs = SyncVectorEnv([lambda i=i: Scripted(i) for i in range(NUM_LANES)])
+    envs = SyncVectorEnv([lambda i=i: Scripted(i) for i in range(NUM_ENVS)])
     got = [t for t, _ in zip(interact(envs, act, np.random.default_rng(0), GAMMA), range(20), strict=False)]
     wanted = stream_of(AutoresetMode.NEXT_STEP).steps(policy_for(False))
     for ours, theirs in zip(got, wanted, strict=False):
@@ -452,7 +454,7 @@ def test_an_environment_inside_a_vector_wrapper_is_watched_as_well() -> None:
         SyncVectorEnv([lambda i=i: Scripted(i, reuse=True) for i in range(3)], autoreset_mode=AutoresetMode.SAME_STEP)
     )
     stream = Interaction(envs, GAMMA, 0)
-    for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(30)])):
+    for env_index, got in enumerate(by_environment([stream.step(policy_for(False)) for _ in range(30)])):
         assert_same(got, plain_loop(Scripted(env_index), len(got))[0])
 
 
@@ -464,7 +466,7 @@ def _forget_the_fake_step(stream: Interaction) -> None:
         def any(self, *args: Any, **kwargs: Any) -> Any:
             return False
 
-    stream._pending = np.zeros(NUM_LANES, bool).view(Never)
+    stream._pending = np.zeros(NUM_ENVS, bool).view(Never)
     original = stream._finish
 
     def finish(last: Any, arrived: Any) -> Any:
@@ -488,7 +490,7 @@ def test_planted_mistakes_are_found(mode: AutoresetMode, plant: Callable[[Intera
     stream = stream_of(mode)
     plant(stream)
     with pytest.raises(AssertionError):
-        for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
+        for env_index, got in enumerate(by_environment([stream.step(policy_for(False)) for _ in range(20)])):
             assert_same(got, plain_loop(Scripted(env_index), len(got))[0])
 
 
@@ -497,5 +499,5 @@ def test_without_copies_a_reused_array_spoils_same_steps_successor() -> None:
     stream = stream_of(AutoresetMode.SAME_STEP, reuse=True)
     stream.envs.envs = [env_index.env for env_index in stream.envs.envs]  # type: ignore[attr-defined]
     with pytest.raises(AssertionError):
-        for env_index, got in enumerate(lanes_of([stream.step(policy_for(False)) for _ in range(20)])):
+        for env_index, got in enumerate(by_environment([stream.step(policy_for(False)) for _ in range(20)])):
             assert_same(got, plain_loop(Scripted(env_index), len(got))[0])

@@ -420,7 +420,7 @@ def test_forward_view_equals_backward_view_for_a_target_policy(layout: str) -> N
 
 
 @pytest.mark.parametrize("form", ["tangent", "head"])
-def test_lanes_are_learners_of_their_own_and_rows_of_weight_0_are_no_experience(form: str) -> None:
+def test_environments_are_learners_of_their_own_and_rows_of_weight_0_are_no_experience(form: str) -> None:
     engine = make_engine(function_of("action-output", NUM_ACTIONS, seed=1), Loss())
     correction = correction_of(form, "action-output", engine)
     chosen = GradientTDSettings("tdc", 0.8, 0.3, 0.2, 0.7)

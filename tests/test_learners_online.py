@@ -357,7 +357,7 @@ def lanes_of(layout: str, engine: Engine, count: int) -> Transition:
 
 @pytest.mark.parametrize("trace", ["accumulating", "dutch"])
 @pytest.mark.parametrize("layout", ["table", "linear", "action-output"])
-def test_lanes_add_up_and_keep_their_own_traces(layout: str, trace: str) -> None:
+def test_environments_add_up_and_keep_their_own_traces(layout: str, trace: str) -> None:
     if layout == "action-output" and trace == "dutch":
         return  # refused, see above
     engine = engine_of(layout)
@@ -373,7 +373,7 @@ def test_lanes_add_up_and_keep_their_own_traces(layout: str, trace: str) -> None
 
 
 @pytest.mark.parametrize("layout", ["table", "action-input"])
-def test_a_lane_of_weight_zero_neither_learns_nor_loses_its_trace(layout: str) -> None:
+def test_an_environment_of_weight_zero_neither_learns_nor_loses_its_trace(layout: str) -> None:
     engine = engine_of(layout)
     t = lanes_of(layout, engine, 2)
     plain, pausing = (OnlineLearner(engine, settings(), num_envs=2) for _ in range(2))

@@ -47,7 +47,7 @@ def test_rewards_are_divided_by_the_spread_of_their_discounted_sum() -> None:
         assert seen.reward_scale == pytest.approx(1.0 if t == 0 else 1 / np.sqrt(var + 1e-8), rel=1e-12)
 
 
-def test_several_lanes_are_learned_from_one_after_another_and_only_those_that_moved() -> None:
+def test_several_environments_are_learned_from_one_after_another_and_only_those_that_moved() -> None:
     x = np.random.default_rng(2).standard_normal((3, 2)).astype(np.float32)
     batch, single = Normalisation((2,), 0.9, 3), Normalisation((2,), 0.9, 1)
     batch.observe(x, np.array([0, 2]))

@@ -38,7 +38,7 @@ def refused_env(actions: NDArray[np.int64], over: NDArray[np.bool_]) -> int:
         over: whether the episode has ended, ``[N]``.
 
     Example:
-        >>> refused_lane(np.array([0, 3]), np.array([False, False]))
+        >>> refused_env(np.array([0, 3]), np.array([False, False]))
         3
     """
     for i in range(len(over)):

@@ -349,7 +349,7 @@ class ReplayBuffer:
             longest = int(self._cursors[:, 1].max())
             raise ValueError(
                 f"cannot draw {length} step(s) in a row: the fullest environment holds {longest} (capacity "
-                f"{self._per_lane} per environment); add steps first, or draw shorter blocks"
+                f"{self._per_env} per environment); add steps first, or draw shorter blocks"
             )
         uniforms = rng.random(len(indices))  # five times as quick as rng.integers; its bias is below starts / 2⁵³
         locate(self._cursors, self._per_env, length, starts, uniforms, indices)

@@ -12,11 +12,6 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from neuralq.runs.stream.acting import choose_epsilon_greedy, epsilon_greedy_policy
-from neuralq.q.inputs import OneHot, Pixels
-from neuralq.runs.stream.encoding import encoder_for
-from neuralq.runs.stream.experience import ExperienceSource, StepExperience, ReplayExperience, RolloutExperience
-from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.learners import (
     GradientSettings,
     Learner,
@@ -30,16 +25,21 @@ from neuralq.learners import (
     StreamingSettings,
 )
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
 from neuralq.q.engine import Engine, Loss, MlpEngine, array_values, make_engine
+from neuralq.q.inputs import OneHot, Pixels
+from neuralq.rules import Linear
+from neuralq.runs.folder import is_resumable
+from neuralq.runs.loop import Plan, Session, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, register_games
 from neuralq.runs.recipe.gradient import gradient_learner, started_at_zero
 from neuralq.runs.recipe.replay import as_distribution, num_atoms, replay_learner
-from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
-from neuralq.rules import Linear
-from neuralq.runs.folder import is_resumable
-from neuralq.runs.loop import Plan, Session, seed_for
+from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
+from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_epsilon_greedy
+from neuralq.runs.stream.encoding import encoder_for
+from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience, StepExperience
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
@@ -175,7 +175,7 @@ def build_session(config: RunConfig) -> Session:
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     values = learner.values if isinstance(learner, StreamingLearner) else engine.all
     arrays = None if isinstance(learner, StreamingLearner) else array_values(engine)
-    policy = epsilon_greedy_policy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
+    policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     evaluation_envs = make_envs(config, config.evaluation_episodes)
     frozen = None if normalisation is None else normalisation.frozen()
     evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index, frozen)

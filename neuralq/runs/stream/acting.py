@@ -16,7 +16,7 @@ from neuralq.checks import check_fraction
 from neuralq.jit import kernel
 from neuralq.types import Array
 
-__all__ = ["EpsilonGreedy", "choose_among", "choose_epsilon_greedy", "choose_greedy", "epsilon_greedy_policy"]
+__all__ = ["EpsilonGreedyPolicy", "choose_among", "choose_epsilon_greedy", "choose_greedy"]
 
 
 @kernel
@@ -111,7 +111,7 @@ def choose_greedy(q: Tensor) -> tuple[Tensor, Tensor]:
     return choose_epsilon_greedy(q, 0.0, np.zeros(len(q)))
 
 
-class EpsilonGreedy:
+class EpsilonGreedyPolicy:
     """A policy that draws from ``rng`` and looks up ε at every step.
 
     Args:
@@ -122,7 +122,7 @@ class EpsilonGreedy:
             tensor is made for one step, which would cost as much as the values of a small network.
 
     Example:
-        >>> policy = EpsilonGreedy(lambda s: -s, lambda: 0.0, np.random.default_rng(0))
+        >>> policy = EpsilonGreedyPolicy(lambda s: -s, lambda: 0.0, np.random.default_rng(0))
         >>> policy(torch.tensor([[1.0, 0.0]]))[0].tolist()
         [1]
     """
@@ -146,18 +146,3 @@ class EpsilonGreedy:
         """The same for an array of observations, with the same draws."""
         assert self._array_values is not None
         return choose_among(self._array_values(s), self._epsilon(), self._rng.random(len(s)))
-
-
-def epsilon_greedy_policy(
-    values: Callable[[Tensor], Tensor],
-    epsilon: Callable[[], float],
-    rng: np.random.Generator,
-    array_values: Callable[[Array], Array] | None = None,
-) -> EpsilonGreedy:
-    """A policy that draws from ``rng`` and looks up ε at every step; arguments as for `EpsilonGreedy`.
-
-    Example:
-        >>> epsilon_greedy_policy(lambda s: s, lambda: 0.0, np.random.default_rng(0))(torch.tensor([[1.0, 0.0]]))[0]
-        tensor([0])
-    """
-    return EpsilonGreedy(values, epsilon, rng, array_values)

@@ -5,9 +5,9 @@ Two targets. *Arrays* for networks and linear features: a `Box` stays as it is (
 vector with a one-hot block for each discrete part, in the order of `gymnasium.spaces.utils.flatten`. *Indices* for
 tables: every finite space becomes one whole number in mixed radix, the first part the most significant digit.
 
-Batches come as Gymnasium's vector environments give them: an array with a leading environment axis for `Box`, `Discrete`,
-`MultiDiscrete` and `MultiBinary`, a tuple of batches for `Tuple`, a dict of batches for `Dict`. An environment is one
-environment of the batch. Whatever is encoded is a fresh array: environments may reuse theirs.
+Batches come as Gymnasium's vector environments give them: an array with one row per environment for `Box`, `Discrete`,
+`MultiDiscrete` and `MultiBinary`, a tuple of batches for `Tuple`, a dict of batches for `Dict`. Whatever is encoded is
+a fresh array: environments may reuse theirs.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ObservationError(ValueError):
 
     def __str__(self) -> str:
         """The message: environment, field, problem."""
-        where = "" if self.env_index is None else f"environment {self.environment}: "
+        where = "" if self.env_index is None else f"environment {self.env_index}: "
         return f"{where}{self.field} {self.problem}"
 
 
@@ -98,9 +98,7 @@ class _Part:
         array = value if type(value) is np.ndarray else _as_array(value, self.keys)
         if array.shape[1:] != self.shape or array.ndim == 0:
             shape = ", ".join(["N", *map(str, self.shape)])
-            way_out = (
-                "; one observation without its environment goes to encode_single" if array.shape == self.shape else ""
-            )
+            way_out = "; a single observation goes to encode_single" if array.shape == self.shape else ""
             raise ObservationError(
                 f"must have shape [{shape}], got {list(array.shape)}{way_out}", field=_name(self.keys)
             )
@@ -138,7 +136,7 @@ class _Part:
         if bad.any():
             env_index, entry = (int(i) for i in np.argwhere(bad)[0])
             low, limit = int(self.starts[entry]), int(self.limits[entry])
-            got = f"got {digits[environment, entry] + low}" + (f" at flat index {entry}" if self.shape else "")
+            got = f"got {digits[env_index, entry] + low}" + (f" at flat index {entry}" if self.shape else "")
             raise ObservationError(f"must lie in {low}..{low + limit - 1}, {got}", env_index, _name(self.keys))
         return digits
 
@@ -159,7 +157,7 @@ class Encoder:
     Made by `encoder_for`.
 
     Args:
-        shape: shape of one encoded observation, without the environment axis.
+        shape: shape of one encoded observation, without the axis of environments.
         dtype: float32, uint8 or bool (frames) or int64 (state indices).
         num_categories: number of states when the encoded observation is a state index (shape ``()``), else None.
     """
@@ -197,7 +195,7 @@ class Encoder:
         return out
 
     def encode_single(self, observation: Any, env_index: int = 0) -> Array:
-        """A fresh array ``[*shape]`` of one observation without an environment axis; ``environment`` is only for the error message.
+        """A fresh array ``[*shape]`` of a single observation; ``env_index`` is what errors name.
 
         Raises:
             ObservationError: as `encode`.
@@ -226,7 +224,7 @@ class Encoder:
         lengths = [len(part.read(batch)) for part in self._parts]
         for part, length in zip(self._parts, lengths, strict=True):
             if length != lengths[0]:
-                problem = f"has {length} environments where {_name(self._parts[0].keys)} has {lengths[0]}"
+                problem = f"has {length} rows where {_name(self._parts[0].keys)} has {lengths[0]}"
                 raise ObservationError(f"{problem}; every part needs one row per environment", field=_name(part.keys))
         return lengths[0]
 

@@ -1,8 +1,7 @@
-"""Feeds: what stands between a stream of experience and a learner, and decides when there is something to learn from.
+"""Experience on its way from a stream to a learner: what is collected, and when there is something to learn from.
 
-A feed is filled with every step and asked after each whether there are samples. `RolloutExperience` hands out a rollout
-``[T, N]`` each time one is full, `ReplayExperience` draws from a replay buffer at its period, `StepExperience` passes every step
-on.
+Every step goes in, and after each it is asked what is due. `RolloutExperience` hands out a rollout ``[T, N]`` each time
+one is full, `ReplayExperience` draws from a replay buffer at its period, `StepExperience` passes every step on.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.runs.stream import ObservationSpec, Step
 from neuralq.types import Array, Transition
 
-__all__ = ["Feed", "StepExperience", "ReplayExperience", "RolloutExperience", "Sample"]
+__all__ = ["ExperienceSource", "ReplayExperience", "RolloutExperience", "Sample", "StepExperience"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +37,7 @@ class Sample:
 
 
 class ExperienceSource(Protocol):
-    """What training asks of a feed."""
+    """What training asks of a source of experience."""
 
     def add(self, step: Step) -> None:
         """Take in one step of the stream."""
@@ -147,6 +146,7 @@ class RolloutExperience:
         """Nothing to restore."""
 
 
+@dataclass
 class ReplayExperience:
     """Stores every step and draws batches, or blocks, at its period.
 
@@ -160,25 +160,18 @@ class ReplayExperience:
         updates_per_period: samples at each of those times.
     """
 
-    def __init__(
-        self,
-        buffer: ReplayBuffer,
-        rng: np.random.Generator,
-        batch_size: int,
-        block_length: int,
-        learning_starts: int,
-        train_period: int,
-        updates_per_period: int,
-    ) -> None:
-        self.buffer = buffer
-        self._rng = rng
-        self._batch_size = batch_size
-        self._block_length = block_length
-        self._learning_starts = learning_starts
-        self._train_period = train_period
-        self._updates_per_period = updates_per_period
+    buffer: ReplayBuffer
+    rng: np.random.Generator
+    batch_size: int
+    block_length: int
+    learning_starts: int
+    train_period: int
+    updates_per_period: int
+
+    def __post_init__(self) -> None:
+        """Nothing is stored yet."""
         self._num_added = 0
-        self._due = learning_starts
+        self._due = self.learning_starts
 
     def add(self, step: Step) -> None:
         """Store one step of each environment that moved."""
@@ -192,19 +185,17 @@ class ReplayExperience:
     def draw(self) -> Iterator[Sample]:
         """The samples that are due."""
         while self._num_added >= self._due:
-            self._due += self._train_period
-            for _ in range(self._updates_per_period):
-                if self._block_length > 1:
-                    blocks = self._batch_size // self._block_length
-                    yield Sample(self.buffer.sample_blocks(blocks, self._block_length, self._rng))
+            self._due += self.train_period
+            for _ in range(self.updates_per_period):
+                if self.block_length > 1:
+                    blocks = self.batch_size // self.block_length
+                    yield Sample(self.buffer.sample_blocks(blocks, self.block_length, self.rng))
+                    continue
+                batch = self.buffer.sample(self.batch_size, self.rng)
+                if self.buffer.prioritised is None:
+                    yield Sample(batch.transition)
                 else:
-                    batch = self.buffer.sample(self._batch_size, self._rng)
-                    prioritised = self.buffer.prioritised is not None
-                    yield Sample(
-                        batch.transition,
-                        batch.weights if prioritised else None,
-                        batch.indices if prioritised else None,
-                    )
+                    yield Sample(batch.transition, batch.weights, batch.indices)
 
     def return_errors(self, sample: Sample, errors: Tensor) -> None:
         """New priorities |δ| where sampling is prioritised."""

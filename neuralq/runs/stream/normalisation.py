@@ -24,21 +24,31 @@ _EPSILON = 1e-8
 
 
 @kernel
+def _take_in(x: float, n: float, j: int, mean: Array, squares: Array) -> None:
+    """Welford's update of entry j with the n-th number."""
+    before = x - (x if n == 1 else mean[j])
+    mean[j] = x - before * (1.0 - 1.0 / n)
+    squares[j] += before * (x - mean[j])
+
+
+@kernel
+def _spread(squares: float, n: float) -> Any:
+    return np.sqrt((squares / (n - 1) if n > 1 else 1.0) + _EPSILON)
+
+
+@kernel
 def _learn(x: Array, env_indices: Array, count: Array, mean: Array, squares: Array) -> None:
-    """Welford's update with the rows ``environments`` of ``x [N, d]``, one after another."""
+    """Welford's update with the rows ``env_indices`` of ``x [N, d]``, one after another."""
     for env_index in env_indices:
         count[0] += 1
         for j in range(mean.size):
-            before = x[env_index, j] - (x[env_index, j] if count[0] == 1 else mean[j])
-            mean[j] = x[env_index, j] - before * (1.0 - 1.0 / count[0])
-            squares[j] += before * (x[env_index, j] - mean[j])
+            _take_in(x[env_index, j], count[0], j, mean, squares)
 
 
 @kernel
 def _scaled(x: Array, count: Array, mean: Array, squares: Array, out: Array) -> None:
     for j in range(mean.size):
-        var = squares[j] / (count[0] - 1) if count[0] > 1 else 1.0
-        inv = 1.0 / np.sqrt(var + _EPSILON)
+        inv = 1.0 / _spread(squares[j], count[0])
         for i in range(x.shape[0]):
             out[i, j] = (x[i, j] - mean[j]) * inv
 
@@ -52,11 +62,8 @@ def _accumulate(
         if moved[env_index]:
             u[env_index] = (0.0 if last_t[env_index] else discount * u[env_index]) + r_t[env_index]
             count[0] += 1
-            before = u[env_index] - (u[env_index] if count[0] == 1 else mean[0])
-            mean[0] = u[env_index] - before * (1.0 - 1.0 / count[0])
-            squares[0] += before * (u[env_index] - mean[0])
-        var = squares[0] / (count[0] - 1) if count[0] > 1 else 1.0
-        out[env_index] = r_t[env_index] / np.sqrt(var + _EPSILON)
+            _take_in(u[env_index], count[0], 0, mean, squares)
+        out[env_index] = r_t[env_index] / _spread(squares[0], count[0])
 
 
 class Normalisation:
@@ -103,7 +110,7 @@ class Normalisation:
         return view
 
     def observe(self, x: Array, env_indices: Array | None = None) -> Array:
-        """Learn from the rows ``environments`` (all if None) and return all rows normalised, ``[N, *shape]`` float32."""
+        """Learn from the rows ``env_indices`` (all if None); returns every row normalised, ``[N, *shape]`` float32."""
         if not self.observations:
             return x
         state = self._state

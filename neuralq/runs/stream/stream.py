@@ -24,7 +24,7 @@ class Policy(Protocol):
     """Observations ``[N, *obs]`` to actions ``[N]`` int64 and the probability of each under this policy ``[N]``.
 
     A policy with an ``on_arrays`` that is not None is asked there, arrays in and arrays out, which spares a tensor or
-    two per step; `neuralq.runs.stream.acting.EpsilonGreedy` has one.
+    two per step; `neuralq.runs.stream.acting.EpsilonGreedyPolicy` has one.
     """
 
     def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
@@ -59,7 +59,7 @@ class ObservationSpec:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """A finished episode: its environment, undiscounted return and length in steps."""
+    """A finished episode: index of its environment, undiscounted return and length in steps."""
 
     env_index: int
     episode_return: float
@@ -70,9 +70,9 @@ class Step(NamedTuple):
     """One step of a batch of environments, with one row for each environment that really moved.
 
     Args:
-        rows: the fields of the `Transition`, in its order, as arrays ``[k, …]``. Feeds copy them; making tensors first
-            would cost as much again as the copying.
-        env_indices: which environment each row is, ``[k]``.
+        rows: the fields of the `Transition`, in its order, as arrays ``[k, …]``. Whoever keeps them copies them;
+            making tensors first would cost as much again as the copying.
+        env_indices: which environment each row comes from, ``[k]``.
         episodes: those that ended with this step.
     """
 
@@ -140,7 +140,7 @@ class Interaction:
         )
 
     def restart(self, seed: int | None) -> None:
-        """Reset every environment: an episode boundary in every environment.
+        """Reset every environment: an episode boundary in all of them.
 
         Raises:
             EnvironmentFault: if an environment raises, or hands out what its space did not promise.
@@ -157,7 +157,7 @@ class Interaction:
     def _observe(
         self, observation: Any, info: Mapping[str, Any], env_indices: Array, over: Array | None = None
     ) -> Array:
-        """Encode a batch, with the action mask of ``environments`` appended where the environment gives one.
+        """Encode a batch, with action masks appended where there are any; ``env_indices`` says whose are new.
 
         Where ``over`` is true the world has ended, and there may be no legal action.
         """
@@ -177,7 +177,7 @@ class Interaction:
         return self._with_mask(encoded)
 
     def _legal(self, info: Mapping[str, Any], env_indices: Array, over: Array | None) -> Array:
-        """The masks of ``environments``, ``[k, A]`` bool; an environment without one may do everything."""
+        """Action masks of ``env_indices``, ``[k, A]`` bool; an environment without one may do everything."""
         legal = np.ones((len(env_indices), self.num_actions), bool)
         given, held = info.get("action_mask"), info.get("_action_mask")
         if given is None:
@@ -188,27 +188,24 @@ class Interaction:
         shapes = [found.shape[1:]] if found.dtype != object else [mask.shape for mask in masks]
         for row, shape in zip(rows, shapes, strict=False):
             if shape != (self.num_actions,):
-                raise self._mask_fault(env_indices[row], f"must have {self.num_actions} entries, got shape {shape}")
+                problem = f"must have {self.num_actions} entries, got shape {shape}"
+                raise self._fault_in(env_indices[row], f"info['action_mask']: {problem}")
         if len(rows):
             legal[rows] = np.asarray(masks) != 0
         for row in np.flatnonzero(~legal.any(-1)):
             if over is None or not over[env_indices[row]]:
-                raise self._mask_fault(
-                    env_indices[row], "must allow an action until the episode has terminated, allows none"
-                )
+                problem = "must allow an action until the episode has terminated, allows none"
+                raise self._fault_in(env_indices[row], f"info['action_mask']: {problem}")
             legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
         return legal
-
-    def _mask_fault(self, env_index: int, problem: str) -> EnvironmentFault:
-        step = self._lengths[env_index] + 1
-        return self._fault(
-            f"environment {environment}, step {step} of its episode, field info['action_mask']: {problem}"
-        )
 
     def _with_mask(self, encoded: Array) -> Array:
         assert self._mask is not None
         flat = encoded.reshape(len(encoded), -1)
         return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
+
+    def _fault_in(self, env_index: int, what: str) -> EnvironmentFault:
+        return self._fault(f"environment {env_index}, step {self._lengths[env_index] + 1} of its episode, field {what}")
 
     def _fault(self, what: str) -> EnvironmentFault:
         self._broken = True
@@ -267,10 +264,7 @@ class Interaction:
             raise self._fault(f"field reward: must have shape ({self.num_envs},), got {r_t.shape}")
         if np.count_nonzero(np.isfinite(r_t)) < r_t.size:
             env_index = int(np.flatnonzero(~np.isfinite(r_t))[0])
-            raise self._fault(
-                f"environment {environment}, step {self._lengths[environment] + 1} of its episode, field reward: must be finite, "
-                f"got {r_t[environment]}"
-            )
+            raise self._fault_in(env_index, f"reward: must be finite, got {r_t[env_index]}")
         return r_t
 
     def _true_successors(self, arrived: Array, last: Array, terminated: Array, info: Mapping[str, Any]) -> Array:

@@ -1,4 +1,4 @@
-"""The environments of a batch, each knowing its place in it: what goes wrong in one of them is told with its index."""
+"""The environments of a batch, each knowing its index in it: what goes wrong in one of them is told with that index."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from neuralq.checks import check_whole
 from neuralq.runs.stream.encoding import encoder_for
 
-__all__ = ["MASK_METHODS", "Lane", "SubEnvFault", "legal_actions", "make_vector_env"]
+__all__ = ["MASK_METHODS", "SubEnv", "SubEnvFault", "legal_actions", "make_vector_env"]
 
 MASK_METHODS = ("action_masks", "valid_action_mask")
 """Methods by which environments tell their legal actions, for those that do not put them into info."""
@@ -48,7 +48,7 @@ def _mask_method(env: gym.Env[Any, Any]) -> Callable[[], Any] | None:
 
 
 class SubEnvFault(RuntimeError):
-    """An environment raised: carries its index so that a batch can say which."""
+    """An environment of a batch raised; the message names its index."""
 
     def __init__(self, index: int, problem: str) -> None:
         super().__init__(f"environment {index}{problem}")

@@ -1,4 +1,4 @@
-"""Feeds: what reaches the learner, when, and with which weight.
+"""Experience: what reaches the learner, when, and with which weight.
 
 Mutants that these tests kill: an idle environment that carries a λ-return across its pause; rows of the last rollout
 that show through; a sample drawn one step early or late; a period that is forgotten when several environments step at
@@ -82,7 +82,7 @@ def rollout_of(stream: Interaction, experience: RolloutExperience) -> Sample:
 @pytest.mark.parametrize("returns", ["peng", "watkins"])
 def test_returns_of_real_rows_are_those_of_a_stream_without_pauses(returns: str) -> None:
     learner = learner_of(returns)
-    paused, plain = stream_of(AutoresetMode.NEXT_STEP), Lanes(stream_of(AutoresetMode.DISABLED))
+    paused, plain = stream_of(AutoresetMode.NEXT_STEP), ByEnvironment(stream_of(AutoresetMode.DISABLED))
     experience = RolloutExperience(T, N, paused.spec)
     for _ in range(3):  # later rollouts are written over earlier ones
         sample = rollout_of(paused, experience)
@@ -92,16 +92,16 @@ def test_returns_of_real_rows_are_those_of_a_stream_without_pauses(returns: str)
         targets = learner.targets(sample.transition)
         for env_index in range(N):
             rows = held[:, env_index]
-            lane_only = sample.transition.map(
+            alone = sample.transition.map(
                 lambda x, env_index=env_index, rows=rows: x[rows][:, env_index : env_index + 1]
             )
             wanted = plain.take(env_index, int(rows.sum()))
-            for ours, theirs in zip(_fields(lane_only), _fields(wanted), strict=True):
+            for ours, theirs in zip(_fields(alone), _fields(wanted), strict=True):
                 assert torch.equal(ours, theirs)
             torch.testing.assert_close(targets[rows, env_index], learner.targets(wanted)[:, 0], rtol=0, atol=1e-12)
 
 
-class Lanes:
+class ByEnvironment:
     """Each environment's steps of a stream that never pauses, as many as are asked for."""
 
     def __init__(self, plain: Interaction) -> None:
@@ -156,7 +156,7 @@ def steps_of(num_envs: int, count: int) -> list[Step]:
     return [stream.step(act) for _ in range(count)]
 
 
-def replay_feed(num_envs: int, *cadence: int, block_length: int = 1, prioritised: bool = False) -> ReplayExperience:
+def replay_of(num_envs: int, *cadence: int, block_length: int = 1, prioritised: bool = False) -> ReplayExperience:
     settings = Prioritised(alpha=1.0, epsilon=1e-12) if prioritised else None
     buffer = ReplayBuffer(300, (), np.int64, num_envs=num_envs, prioritised=settings)
     return ReplayExperience(buffer, np.random.default_rng(0), 8, block_length, *cadence)
@@ -174,7 +174,7 @@ def replay_feed(num_envs: int, *cadence: int, block_length: int = 1, prioritised
     ],
 )
 def test_samples_come_when_they_are_due(num_envs: int, cadence: tuple[int, ...], wanted: list[int]) -> None:
-    experience = replay_feed(num_envs, *cadence)
+    experience = replay_of(num_envs, *cadence)
     got = []
     for step in steps_of(num_envs, len(wanted)):
         experience.add(step)
@@ -185,7 +185,7 @@ def test_samples_come_when_they_are_due(num_envs: int, cadence: tuple[int, ...],
 
 
 def test_what_is_drawn_is_what_was_added() -> None:
-    experience = replay_feed(3, 1, 1, 1)
+    experience = replay_of(3, 1, 1, 1)
     added: dict[int, tuple[float, ...]] = {}
     for step in steps_of(3, 20):
         experience.add(step)
@@ -196,8 +196,8 @@ def test_what_is_drawn_is_what_was_added() -> None:
                 assert tuple(map(float, row)) == pytest.approx(added[int(row[0])], rel=1e-6)
 
 
-def test_blocks_are_consecutive_steps_of_one_lane() -> None:
-    experience = replay_feed(3, 12, 3, 1, block_length=4)
+def test_blocks_are_consecutive_steps_of_one_environment() -> None:
+    experience = replay_of(3, 12, 3, 1, block_length=4)
     seen = 0
     for step in steps_of(3, 30):
         experience.add(step)
@@ -211,7 +211,7 @@ def test_blocks_are_consecutive_steps_of_one_lane() -> None:
 
 
 def test_errors_come_back_as_the_priorities_of_the_steps_they_belong_to() -> None:
-    experience = replay_feed(1, 5, 100, 1, prioritised=True)
+    experience = replay_of(1, 5, 100, 1, prioritised=True)
     for step in steps_of(1, 5):
         experience.add(step)
     (sample,) = experience.draw()
@@ -222,15 +222,15 @@ def test_errors_come_back_as_the_priorities_of_the_steps_they_belong_to() -> Non
     assert set(experience.buffer.sample(32, np.random.default_rng(0)).indices.tolist()) == {2}
 
 
-def test_a_restored_replay_feed_draws_the_same() -> None:
+def test_a_restored_replay_of_draws_the_same() -> None:
     steps = steps_of(2, 12)
-    one, two = replay_feed(2, 3, 3, 1, prioritised=True), replay_feed(2, 3, 3, 1, prioritised=True)
+    one, two = replay_of(2, 3, 3, 1, prioritised=True), replay_of(2, 3, 3, 1, prioritised=True)
     for step in steps[:7]:
         one.add(step)
         for sample in one.draw():
             one.return_errors(sample, sample.transition.r_t)
     two.load_state_dict(one.state_dict())
-    two._rng.bit_generator.state = one._rng.bit_generator.state
+    two.rng.bit_generator.state = one.rng.bit_generator.state
     for step in steps[7:]:
         one.add(step)
         two.add(step)
