@@ -13,7 +13,7 @@ from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings, StreamingSettings
 from neuralq.q import MLP, Custom
 from neuralq.runs import RunConfig
-from neuralq.runs.folder import Resumability
+from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session, engine_name

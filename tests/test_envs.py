@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 
 import neuralq_envs
 from neuralq.mdp import FiniteMDP
-from neuralq.runs.folder import is_resumable
+from neuralq.runs.folder.env_probe import is_resumable
 from neuralq_envs import mitchell
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.baird import make as make_star

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MaskedQ, TableQ
-from neuralq.runs.folder import encode_env, restore_env
+from neuralq.runs.folder.env_encode import encode_env
+from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.stream import EnvironmentFault, Interaction, Step, interact, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy
 from neuralq.runs.stream.experience import ReplayExperience

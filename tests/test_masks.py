@@ -25,7 +25,7 @@ from neuralq.q import MLP, MaskedQ
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import evaluate_greedy
-from neuralq.runs.folder import Resumability
+from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.loop import Session
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session

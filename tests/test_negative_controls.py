@@ -31,7 +31,7 @@ from neuralq.learners import (
     StreamingSettings,
 )
 from neuralq.runs import RunConfig
-from neuralq.runs.folder import Resumability
+from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session
 from neuralq.runs.stream import Step

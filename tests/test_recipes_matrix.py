@@ -18,7 +18,7 @@ from gymnasium import spaces
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP, Conv
 from neuralq.runs import RunConfig
-from neuralq.runs.folder import Resumability
+from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session
 from neuralq.runs.recipe.config import LAYOUTS, LEARNERS, NETWORKS

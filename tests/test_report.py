@@ -23,12 +23,13 @@ import numpy as np
 import pytest
 
 from neuralq.checks import MissingExtra
+from neuralq.runs.folder.files import RunFolderError
 from neuralq.runs.report import divergence as divergence_module
 from neuralq.runs.report import (
     divergence_svg,
     growth_table,
     learning_curve_svg,
-    read_metrics,
+    read_rows,
     signals_svg,
     values_table,
     write_demo_report,
@@ -50,7 +51,7 @@ class Outline(HTMLParser):
         self.references: list[str] = []
         self.outside: list[tuple[str, str]] = []
         self.text = ""
-        self.experience(page)
+        self.feed(page)
         self.close()
         assert not self.open, f"never closed: {self.open}"
 
@@ -262,16 +263,16 @@ def test_thinning_keeps_ends_and_spikes() -> None:
 def test_a_torn_last_line_is_forgiven_and_a_torn_middle_line_named(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"env_steps": 1}\n\n{"env_steps": 2}\n{"env_st')
-    assert [row["env_steps"] for row in read_metrics(path)] == [1, 2]
+    assert [row["env_steps"] for row in read_rows(path)] == [1, 2]
     path.write_text('{"env_steps": 1}\n{"env_st\n{"env_steps": 3}\n')
-    with pytest.raises(ValueError, match=r"metrics\.jsonl line 2 is no JSON object"):
-        read_metrics(path)
+    with pytest.raises(RunFolderError, match=r"metrics\.jsonl, line 2, is no row of metrics"):
+        read_rows(path)
     (tmp_path / "config.json").write_text("[1]")
     path.write_text("")
-    with pytest.raises(ValueError, match=r"config\.json must hold a JSON object, got list"):
+    with pytest.raises(RunFolderError, match=r"config\.json is damaged: it must hold a JSON object, got list"):
         write_report(tmp_path)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(ValueError, match=r"config\.json is not valid JSON"):
+    with pytest.raises(RunFolderError, match=r"config\.json is damaged"):
         write_report(tmp_path)
 
 

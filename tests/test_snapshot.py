@@ -27,7 +27,10 @@ from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from neuralq.mdp import FiniteMDP
-from neuralq.runs.folder import NotCopyable, checkpoint, encode_env, is_resumable, restore_env
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.env_encode import NotCopyable, encode_env
+from neuralq.runs.folder.env_probe import is_resumable
+from neuralq.runs.folder.env_restore import restore_env
 
 NEWEST_TAXI = max(name for name in gymnasium.registry if name.startswith("Taxi-v"))
 CLASSIC = ["CartPole-v1", NEWEST_TAXI, "FrozenLake-v1", "Blackjack-v1", "MountainCar-v0", "Acrobot-v1", "Pendulum-v1"]

@@ -24,7 +24,7 @@ from neuralq.apps.cli import main, sweeps
 from neuralq.apps.cli.sweeps import SweepBar
 from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
 from neuralq.runs.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
-from neuralq.runs.sweep import processes as crew_module
+from neuralq.runs.sweep import processes as processes_module
 
 CHILD = """
 import json, os, pathlib, signal, sys, time
@@ -76,7 +76,7 @@ class Children:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew_module, "_POLL_SECONDS", 0.01)
+    monkeypatch.setattr(processes_module, "_POLL_SECONDS", 0.01)
 
 
 def a_sweep(tmp_path: Path, num_seeds: int = 4, **config: Any) -> Sweep:
@@ -179,7 +179,7 @@ def test_one_process_runs_a_sweep(tmp_path: Path) -> None:
     sweep = a_sweep(tmp_path, 1)
 
     def watch(status: Status) -> None:
-        with pytest.raises(RunFolderBusy, match="another process is running the sweep"):
+        with pytest.raises(RunFolderBusy, match=f"the sweep in {sweep.path} is being run by process {os.getpid()}"):
             run_sweep(sweep, Children())
 
     assert len(run_sweep(sweep, Children(), 1, watch).returns) == 1

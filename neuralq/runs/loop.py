@@ -7,12 +7,10 @@ It knows no algorithm. What a run consists of is in `Session`, what is asked of 
 from __future__ import annotations
 
 import contextlib
-import signal
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from types import FrameType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -28,11 +26,14 @@ from neuralq.runs.stream import Interaction, Policy
 from neuralq.learners.averaging import evaluation_parameters, evaluating_with
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.folder.run_folder import RunFolder
-from neuralq.runs.folder import Resumability, encode_env, restore_env
+from neuralq.runs.folder.env_encode import encode_env
+from neuralq.runs.folder.env_probe import Resumability
+from neuralq.runs.folder.env_restore import restore_env
+from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.clock import Stopwatch
 from neuralq.types import Transition
 
-__all__ = ["Diverged", "Hook", "Observer", "Plan", "Progress", "Session", "StopRequest", "fit", "restore", "seed_for"]
+__all__ = ["Diverged", "Hook", "Observer", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
 
 
 class Hook(Protocol):
@@ -161,32 +162,6 @@ def seed_for(seed: int, *purpose: int) -> int:
         True
     """
     return int(np.random.SeedSequence([seed, *purpose]).generate_state(1)[0] >> 1)
-
-
-class StopRequest:
-    """Remembers SIGTERM and SIGINT by ``name``, so that a loop can save before it ends."""
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.name is not None:  # asked twice: at once
-            raise KeyboardInterrupt
-        self.name = signal.Signals(number).name
-
-    @contextlib.contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen while the block runs; outside the main thread, where Python allows no handlers, do nothing."""
-        try:
-            before = {n: signal.signal(n, self._note) for n in (signal.SIGTERM, signal.SIGINT)}
-        except ValueError:
-            yield
-            return
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> Progress:

@@ -76,7 +76,7 @@ def encode_env(env: Any) -> dict[str, Any]:
         NotCopyable: naming the attribute that cannot be read as plain values, and its type.
 
     Example:
-        >>> from neuralq.runs.folder import restore_env
+        >>> from neuralq.runs.folder.env_restore import restore_env
         >>> env, fresh = gymnasium.make("CartPole-v1"), gymnasium.make("CartPole-v1")
         >>> _ = env.reset(seed=1)
         >>> tree = encode_env(env)

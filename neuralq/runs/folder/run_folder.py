@@ -11,21 +11,28 @@ dies. Reading needs no lock: whole files are replaced in one step, and a half-wr
 
 from __future__ import annotations
 
-import fcntl
 import importlib.metadata
 import json
-import math
 import os
 import platform
 import re
 from collections.abc import Mapping
 from datetime import datetime
-from numbers import Integral, Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from neuralq.checks import check_whole
+from neuralq.runs.folder.files import (
+    FolderLock,
+    RunFolderBusy,
+    RunFolderError,
+    plain_values,
+    read_json,
+    read_rows,
+    to_json,
+    write_durably,
+)
 
 __all__ = [
     "RunFolder",
@@ -47,14 +54,6 @@ FORMAT_VERSION = 1
 _LIBRARIES = ("torch", "numpy", "scipy", "gymnasium", "numba", "safetensors")
 
 
-class RunFolderError(RuntimeError):
-    """A folder is not what the call needs: no run where one is expected, a run where none may be, or a damaged one."""
-
-
-class RunFolderBusy(RunFolderError):
-    """Another process is writing this run folder; the message names the folder and that process."""
-
-
 class RunFolder:
     """The one writer of a run folder; holds the folder's lock until closed.
 
@@ -70,9 +69,9 @@ class RunFolder:
         [{'env_steps': 100, 'loss': 0.5}, {'env_steps': 200, 'loss': None}]
     """
 
-    def __init__(self, path: Path, lock: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock: int | None = lock
+        self._lock = FolderLock(path / "run.lock", f"{path} is being written")
 
     @classmethod
     def create(cls, path: str | Path, *, config: Mapping[str, Any], seed: int) -> RunFolder:
@@ -85,16 +84,16 @@ class RunFolder:
             TypeError: if ``config`` holds what JSON cannot express.
         """
         check_whole("seed", seed, 0)
-        document = _strict_json(dict(config), "config")
+        document = to_json(config, "config")
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
-        run = cls(path, _lock(path))
+        run = cls(path)
         try:
             refuse_old_run(path)
-            _write_durably(path / "config.json", document)
-            _write_durably(path / "versions.json", _strict_json(library_versions(), "versions"))
+            write_durably(path / "config.json", document)
+            write_durably(path / "versions.json", to_json(library_versions(), "versions"))
             marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seed": int(seed)}
-            _write_durably(path / "run.json", _strict_json(marker, "run"))
+            write_durably(path / "run.json", to_json(marker, "run"))
         except BaseException:
             run.close()
             raise
@@ -110,7 +109,7 @@ class RunFolder:
         """
         path = Path(path)
         _read_marker(path)
-        run = cls(path, _lock(path))
+        run = cls(path)
         try:
             _cut_torn_line(run.metrics_path)
         except BaseException:
@@ -147,7 +146,7 @@ class RunFolder:
         if "env_steps" not in row:
             raise ValueError(f"a row of metrics must hold env_steps, got only {sorted(row)}")
         check_whole("env_steps", row["env_steps"], 0)  # type: ignore[arg-type]  # it checks what it is given
-        line = json.dumps({name: _plain(value, name) for name, value in row.items()}, allow_nan=False)
+        line = json.dumps({name: plain_values(value, name) for name, value in row.items()}, allow_nan=False)
         with open(self.metrics_path, "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
@@ -164,13 +163,13 @@ class RunFolder:
         rows = read_metrics(self.path)
         kept = [row for row in rows if row["env_steps"] <= after_env_steps]
         if len(kept) < len(rows):
-            _write_durably(self.metrics_path, "".join(json.dumps(row) + "\n" for row in kept))
+            write_durably(self.metrics_path, "".join(json.dumps(row) + "\n" for row in kept))
         return len(rows) - len(kept)
 
     def replace_config(self, config: Mapping[str, Any]) -> None:
         """The effective configuration from now on (a resumed run may have a new budget), replaced in one step."""
         self._check_open()
-        _write_durably(self.path / "config.json", _strict_json(dict(config), "config"))
+        write_durably(self.path / "config.json", to_json(config, "config"))
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """The final result, replaced in one step; NaN and infinities become null.
@@ -179,14 +178,11 @@ class RunFolder:
             TypeError: for a value that JSON cannot express.
         """
         self._check_open()
-        _write_durably(self.path / "summary.json", _strict_json(_plain(dict(summary), "summary"), "summary"))
+        write_durably(self.path / "summary.json", to_json(plain_values(summary, "summary"), "summary"))
 
     def close(self) -> None:
         """Gives the lock back; closing twice is fine."""
-        if self._lock is not None:
-            os.ftruncate(self._lock, 0)
-            os.close(self._lock)
-            self._lock = None
+        self._lock.close()
 
     def __enter__(self) -> RunFolder:
         return self
@@ -195,7 +191,7 @@ class RunFolder:
         self.close()
 
     def _check_open(self) -> None:
-        if self._lock is None:
+        if not self._lock.is_held:
             raise RunFolderError(f"{self.path} was closed, and is no longer ours to write; open it again")
 
 
@@ -240,7 +236,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
         RunFolderError: if there is no run in ``path``, or its file is damaged.
     """
     _read_marker(Path(path))
-    return _read_json(Path(path) / "config.json")
+    return read_json(Path(path) / "config.json")
 
 
 def read_versions(path: str | Path) -> dict[str, str]:
@@ -250,7 +246,7 @@ def read_versions(path: str | Path) -> dict[str, str]:
         RunFolderError: if there is no run in ``path``, or its file is damaged.
     """
     _read_marker(Path(path))
-    return _read_json(Path(path) / "versions.json")
+    return read_json(Path(path) / "versions.json")
 
 
 def read_seed(path: str | Path) -> int:
@@ -272,7 +268,7 @@ def read_summary(path: str | Path) -> dict[str, Any]:
     file = Path(path) / "summary.json"
     if not file.exists():
         raise RunFolderError(f"the run in {path} has no summary yet: finish it with `neuralq resume {path}`")
-    return _read_json(file)
+    return read_json(file)
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
@@ -284,24 +280,14 @@ def read_metrics(path: str | Path) -> list[dict[str, Any]]:
         RunFolderError: if there is no run in ``path``, or a line other than the last is damaged.
     """
     _read_marker(Path(path))
-    file = Path(path) / "metrics.jsonl"
-    lines = file.read_bytes().split(b"\n")[:-1] if file.exists() else []
-    rows = []
-    for number, line in enumerate(lines, 1):
-        try:
-            row = json.loads(line)
-            check_whole("env_steps", row["env_steps"], 0)
-        except (ValueError, TypeError, KeyError) as error:
-            raise RunFolderError(f"{file}, line {number}, is no row of metrics ({error}); delete the line") from error
-        rows.append(row)
-    return rows
+    return read_rows(Path(path) / "metrics.jsonl")
 
 
 def _read_marker(path: Path) -> dict[str, Any]:
     file = path / "run.json"
     if not file.is_file():
         raise RunFolderError(f"there is no neuralq run in {path}; start one with `neuralq train ENV --run-dir {path}`")
-    marker = _read_json(file)
+    marker = read_json(file)
     if marker.get("format") != FORMAT_NAME or type(marker.get("seed")) is not int:
         raise RunFolderError(f"{file} was not written by neuralq; choose another folder with --run-dir")
     if not isinstance(marker.get("version"), int) or marker["version"] > FORMAT_VERSION:
@@ -322,25 +308,6 @@ def refuse_old_run(path: Path) -> None:
             )
 
 
-def _lock(path: Path) -> int:
-    """A file descriptor that holds the exclusive lock of a run folder; the file tells others whose it is."""
-    lock = os.open(path / "run.lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "unknown"
-        os.close(lock)
-        raise RunFolderBusy(
-            f"{path} is being written by process {holder}; wait for it, stop it, or choose another folder"
-        ) from error
-    except BaseException:
-        os.close(lock)
-        raise
-    os.ftruncate(lock, 0)
-    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
-    return lock
-
-
 def _cut_torn_line(path: Path) -> None:
     """So that the next row does not continue the line that a killed writer left."""
     if path.exists():
@@ -348,52 +315,3 @@ def _cut_torn_line(path: Path) -> None:
         whole = content.rfind(b"\n") + 1
         if whole < len(content):
             os.truncate(path, whole)
-
-
-def _plain(value: Any, place: str) -> Any:
-    """``value`` in what JSON has words for; scalars of NumPy and 0-d tensors as numbers, the non-finite as None."""
-    if value is None or isinstance(value, str | bool):
-        return value
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v, f"{place}[{k!r}]") for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v, f"{place}[{i}]") for i, v in enumerate(value)]
-    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
-        return _plain(value.item(), place)
-    if isinstance(value, Integral):
-        return int(value)
-    if isinstance(value, Real):
-        return float(value) if math.isfinite(value) else None
-    raise TypeError(f"{place} must be a number, a string or None, got {type(value).__name__}")
-
-
-def _strict_json(value: Any, name: str) -> str:
-    try:
-        return json.dumps(value, indent=2, allow_nan=False) + "\n"
-    except ValueError as error:
-        raise ValueError(f"{name} holds a number that JSON has no word for ({error}); use null instead") from error
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{path} is damaged or missing: {error}") from error
-    if not isinstance(value, dict):
-        raise RunFolderError(f"{path} is damaged: it holds a {type(value).__name__}, not an object")
-    return value
-
-
-def _write_durably(path: Path, text: str) -> None:
-    """Readers see the old content or the new, also after a power cut."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with open(temporary, "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

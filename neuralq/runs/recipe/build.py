@@ -30,7 +30,7 @@ from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, S
 from neuralq.q.engine import Engine, Loss, MlpEngine, array_values, make_engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
-from neuralq.runs.folder import is_resumable
+from neuralq.runs.folder.env_probe import is_resumable
 from neuralq.runs.loop import Plan, Session, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, register_games

@@ -1,63 +1,18 @@
-"""What a run folder says: its JSON files and the rows of ``metrics.jsonl``, made into series that can be drawn."""
+"""The rows of a ``metrics.jsonl`` as series that can be drawn."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neuralq.types import Floats
 
-__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "read_json", "read_metrics", "thin"]
+__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "thin"]
 
 Row = Mapping[str, Any]
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The rows of a ``metrics.jsonl``; a last line cut short by a crash is left out, a missing file has no rows.
-
-    Raises:
-        ValueError: a line that is not the last is no JSON object; names the line.
-    """
-    if not path.exists():
-        return []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    rows: list[dict[str, Any]] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            row = json.loads(line)
-        except ValueError:
-            row = None
-        if isinstance(row, dict):
-            rows.append(row)
-        elif number < len(lines):
-            raise ValueError(
-                f"{path} line {number} is no JSON object: {line[:80]!r}; remove the line or restore the file"
-            )
-    return rows
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; a missing file is an empty one.
-
-    Raises:
-        ValueError: the file holds something else; names it.
-    """
-    if not path.exists():
-        return {}
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not valid JSON ({error}); restore it or remove it") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
-    return value
 
 
 def as_float(value: Any) -> float:

@@ -9,7 +9,8 @@ from typing import Any
 
 from neuralq.runs.report.curves import SIGNALS, learning_curve_svg, signals_svg
 from neuralq.runs.report.page import Page, facts_table, flatten
-from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite, read_json, read_metrics
+from neuralq.runs.folder.files import read_json, read_rows
+from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite
 
 __all__ = ["write_report"]
 
@@ -25,7 +26,7 @@ def write_report(run_dir: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: the folder holds none of them.
-        ValueError: one of them is damaged; names it.
+        RunFolderError: one of them is damaged; names it.
         MissingExtra: matplotlib is not installed.
 
     Example:
@@ -38,8 +39,9 @@ def write_report(run_dir: str | Path) -> Path:
     folder = Path(run_dir)
     if not any((folder / file).exists() for file in _FILES):
         raise FileNotFoundError(f"{folder} is no run folder: it holds none of {', '.join(_FILES)}; pass one that does")
-    rows = read_metrics(folder / "metrics.jsonl")
-    config, versions, summary = (read_json(folder / f"{file}.json") for file in ("config", "versions", "summary"))
+    rows = read_rows(folder / "metrics.jsonl")
+    files = (folder / f"{name}.json" for name in ("config", "versions", "summary"))
+    config, versions, summary = (read_json(file) if file.exists() else {} for file in files)
     target = _first_number(config, _TARGET_KEYS)
     page = Page(_title(config, folder), lead=_lead(rows, target))
     page.heading("Result")

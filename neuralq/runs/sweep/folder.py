@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.checks import check_whole
+from neuralq.runs.folder.files import read_json, to_json, write_durably
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_summary
 
-__all__ = ["Sweep", "create_sweep", "has_finished", "is_sweep_folder", "open_sweep", "steps_so_far", "write_json"]
+__all__ = ["Sweep", "create_sweep", "has_finished", "is_sweep_folder", "open_sweep", "steps_so_far"]
 
 FORMAT_NAME = "neuralq-sweep"
 FORMAT_VERSION = 1
@@ -84,9 +85,9 @@ def create_sweep(
     if is_run_folder(path):
         raise RunFolderError(f"{path} already holds a run; choose another folder with --run-dir")
     path.mkdir(parents=True, exist_ok=True)
-    write_json(path / "config.json", dict(config))
+    write_durably(path / "config.json", to_json(config, "config"))
     marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seeds": list(seeds), "options": list(options)}
-    write_json(path / "sweep.json", marker)  # last: it marks a sweep
+    write_durably(path / "sweep.json", to_json(marker, "sweep"))  # last: it marks a sweep
     return Sweep(path, dict(config), tuple(seeds), tuple(options))
 
 
@@ -109,7 +110,7 @@ def open_sweep(path: str | Path, total_steps: int | None = None) -> Sweep:
     if total_steps is not None:
         check_whole("total_steps", total_steps)
         sweep.config["total_steps"] = total_steps
-        write_json(path / "config.json", sweep.config)
+        write_durably(path / "config.json", to_json(sweep.config, "config"))
     return sweep
 
 
@@ -136,10 +137,3 @@ def steps_so_far(run_dir: Path) -> int:
             return int(json.loads(last)["env_steps"])
     except (OSError, ValueError, KeyError, TypeError):
         return 0
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a file in one step: readers see the old content or the new."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)

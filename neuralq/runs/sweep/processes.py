@@ -1,24 +1,25 @@
-"""The processes of a sweep: begun, watched, asked to stop, and what each came to."""
+"""The processes of a sweep: begun, watched, asked to stop, and the result of each."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neuralq.runs.sweep.statistics import Estimate, estimate
 from neuralq.checks import check_whole
-from neuralq.runs.folder.run_folder import RunFolderBusy, read_summary
-from neuralq.runs.sweep.folder import Sweep, has_finished, steps_so_far, write_json
+from neuralq.runs.folder.files import FolderLock, to_json, write_durably
+from neuralq.runs.folder.run_folder import read_summary
+from neuralq.runs.stop_request import StopRequest
+from neuralq.runs.sweep.folder import Sweep, has_finished, steps_so_far
 
 __all__ = ["SeedResult", "Status", "SweepResult", "num_cores", "run_sweep", "stop_with_parent"]
 
@@ -28,7 +29,7 @@ _TAIL_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class SeedResult:
-    """What one seed came to.
+    """The result of one seed.
 
     Args:
         seed: which.
@@ -47,7 +48,7 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep came to: one result per seed, and the name of the signal that ended it early, if one did."""
+    """The result of a sweep: one per seed, and the name of the signal that ended it early, if one did."""
 
     runs: tuple[SeedResult, ...]
     interrupted_by: str | None = None
@@ -135,26 +136,27 @@ def run_sweep(
         RunFolderBusy: if another process is running this sweep.
     """
     check_whole("num_workers", num_workers := num_cores() if num_workers is None else num_workers)
-    with _locked(sweep.path), _listening() as asked:
-        crew = _Crew(sweep, command)
+    request, processes = StopRequest(), _Processes(sweep, command)
+    lock = FolderLock(sweep.path / "sweep.lock", f"the sweep in {sweep.path} is being run")
+    with contextlib.closing(lock), request.listening():
         try:
-            while crew.waiting or crew.running:
-                if asked:
-                    crew.stop()
-                while crew.waiting and len(crew.running) < num_workers:
-                    crew.start(crew.waiting.pop(0))
+            while processes.waiting or processes.running:
+                if request.name is not None:
+                    processes.stop()
+                while processes.waiting and len(processes.running) < num_workers:
+                    processes.start(processes.waiting.pop(0))
                 time.sleep(_POLL_SECONDS)
-                crew.collect()
+                processes.collect()
                 if watch is not None:
-                    watch(crew.status())
+                    watch(processes.status())
         finally:
-            crew.kill()
-        result = SweepResult(tuple(crew.result(seed) for seed in sweep.seeds), asked[0] if asked else None)
-        write_json(sweep.path / "summary.json", result.plain())
+            processes.kill()
+        result = SweepResult(tuple(processes.result(seed) for seed in sweep.seeds), request.name)
+        write_durably(sweep.path / "summary.json", to_json(result.plain(), "summary"))
     return result
 
 
-class _Crew:
+class _Processes:
     """The processes of a sweep: which seeds wait, which run and why those that failed did."""
 
     def __init__(self, sweep: Sweep, command: Callable[[Sweep, int], Sequence[str]]) -> None:
@@ -254,34 +256,3 @@ def _reason(log: Path, status: int) -> str:
         lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     said = lines[-1].strip().removeprefix("neuralq: ").removeprefix("error: ") if lines else ""
     return said or f"ended with status {status}"
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with open(path / "sweep.lock", "ab") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunFolderBusy(f"another process is running the sweep in {path}; wait for it or stop it") from error
-        yield
-
-
-@contextlib.contextmanager
-def _listening() -> Iterator[list[str]]:
-    """The names of SIGINT and SIGTERM as they come in; asked twice, KeyboardInterrupt."""
-    asked: list[str] = []
-
-    def note(number: int, frame: object) -> None:
-        asked.append(signal.Signals(number).name)
-        if len(asked) > 1:
-            raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield asked  # Python allows handlers in the main thread alone
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -32,7 +32,8 @@ from neuralq.runs.folder.run_folder import (
     read_config,
     refuse_old_run,
 )
-from neuralq.runs.loop import Diverged, Hook, StopRequest, seed_for
+from neuralq.runs.loop import Diverged, Hook, seed_for
+from neuralq.runs.stop_request import StopRequest
 from neuralq.systems.backgammon.agent import BackgammonAgent
 from neuralq.systems.backgammon.config import KIND, TdGammonConfig, config_from_dict, config_to_dict
 from neuralq.systems.backgammon.match import play_match
