@@ -17,11 +17,11 @@ import pytest
 import torch
 
 from neuralq.learners import GradientSettings, HeadCorrection, TangentCorrection
+from neuralq.learners.gradient.settings import gradient_learner, started_at_zero
 from neuralq.q import MLP, Conv, Custom
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs import RunConfig, load, train
 from neuralq.runs.recipe.build import build_q, build_session
-from neuralq.runs.recipe.gradient import gradient_learner, started_at_zero
 from neuralq.runs.stream import ObservationSpec
 from neuralq.types import Transition
 

@@ -17,7 +17,15 @@ import numpy as np
 import pytest
 import torch
 
-from neuralq.learners import DistributionalLearner, DQRCLearner, DQRCSettings, ReplayLearner, ReplaySettings
+from neuralq.learners import (
+    DistributionalLearner,
+    DQRCLearner,
+    DQRCSettings,
+    Parts,
+    ReplayLearner,
+    ReplaySettings,
+    learner_kinds,
+)
 from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MLP, ActionOutputQ, CategoricalQ, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
 from neuralq.q.engine import Loss, MlpEngine, TorchEngine, make_engine
@@ -26,7 +34,6 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.recipe.build import build_session
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
-from neuralq.runs.recipe.replay import replay_learner
 from neuralq.types import Transition
 
 F64 = torch.float64
@@ -158,8 +165,9 @@ def learned(rule: str, seed: int, wrong: bool = False) -> Any:
     if rule != "dqrc":
         given["target_period_updates"] = 5
     settings = ReplaySettings(**given)
-    config = RunConfig(learner="replay", layout="table", replay=settings)
-    learner = replay_learner(config, TorchEngine(TableQ(LENGTH, 2), Loss("squared")))
+    engine = TorchEngine(TableQ(LENGTH, 2), Loss("squared"))
+    parts = Parts(engine, settings, np.random.default_rng(0), GAMMA, 1.0, 500, "auto", lambda: TableQ(LENGTH, 2))
+    learner = learner_kinds()["replay"].build(parts)
     assert isinstance(learner, DQRCLearner) == (rule == "dqrc")
     buffer, rng = chain_buffer(seed, wrong), np.random.default_rng(seed)
     for _ in range(500):

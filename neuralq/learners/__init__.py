@@ -19,7 +19,8 @@ from neuralq.learners.gradient.learner import GradientPredictionLearner, Gradien
 from neuralq.learners.gradient.residual import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.gradient.settings import GradientSettings
 from neuralq.learners.gradient.step import GradientTDSettings
-from neuralq.learners.learner import Descent, Learner, Update
+from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits, learner_kinds
+from neuralq.learners.learner import Descent, HasEngineName, HasValues, Learner, Update
 from neuralq.learners.replay.distributional import DistributionalLearner
 from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
@@ -37,13 +38,18 @@ __all__ = [
     "GradientQLearner",
     "GradientSettings",
     "GradientTDSettings",
+    "HasEngineName",
+    "HasValues",
     "HeadCorrection",
     "Learner",
+    "LearnerKind",
     "OnlineLearner",
     "OnlineSettings",
+    "Parts",
     "PredictionLearner",
     "ReplayLearner",
     "ReplaySettings",
+    "Representation",
     "ResidualGradientLearner",
     "ResidualGradientSettings",
     "RolloutLearner",
@@ -51,6 +57,8 @@ __all__ = [
     "StreamingLearner",
     "StreamingSettings",
     "TangentCorrection",
+    "Traits",
     "TwinHead",
     "Update",
+    "learner_kinds",
 ]

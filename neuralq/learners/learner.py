@@ -1,10 +1,10 @@
-"""What an update returns, and the descent step that batch learners share."""
+"""What training asks of a learner, what an update returns, and the descent step that batch learners share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.q.engine import Engine, on_arrays
 from neuralq.types import Array, Metrics, Transition
 
-__all__ = ["Descent", "Learner", "Update"]
+__all__ = ["Descent", "HasEngineName", "HasValues", "Learner", "Update"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +58,30 @@ class Learner(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that a continued run needs."""
+        """Everything that a continued run needs; the flat parameters are under "parameters", or so in "descent"."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
+        ...
+
+
+@runtime_checkable
+class HasValues(Protocol):
+    """A learner that acts by values of its own, the quick way to those of its engine."""
+
+    def values(self, s: Tensor) -> Tensor:
+        """Action values ``[N, *obs] -> [N, A]``."""
+        ...
+
+
+@runtime_checkable
+class HasEngineName(Protocol):
+    """A learner for which "compiled" or "torch", as the engine's kind says, would not be the whole truth."""
+
+    @property
+    def engine_name(self) -> str:
+        """What computes: "compiled" kernels altogether, "torch", or "compiled and torch", each a part."""
         ...
 
 

@@ -17,12 +17,13 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.learners.averaging import IterateAverage
+from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
 from neuralq.q.engine import Engine
 from neuralq.types import Array, Transition
 
-__all__ = ["RolloutLearner", "RolloutSettings"]
+__all__ = ["ROLLOUT", "RolloutLearner", "RolloutSettings"]
 
 
 @dataclass(frozen=True)
@@ -221,3 +222,23 @@ class RolloutLearner:
         self._descent.load_state_dict(state["descent"])
         if self._average is not None:
             self._average.load_state_dict(state["average"])
+
+
+def _build(parts: Parts) -> RolloutLearner:
+    settings: RolloutSettings = parts.settings
+    rows = settings.num_envs * settings.num_steps
+    annealed_over = settings.anneal_env_steps or parts.total_steps
+    total_updates = -(-annealed_over // rows) if settings.anneal else None
+    return RolloutLearner(parts.engine, settings, parts.rng, parts.reward_scale, total_updates)
+
+
+ROLLOUT = LearnerKind(
+    name="rollout",
+    title="λ-returns over rollouts of parallel environments (PQN)",
+    source="Peng & Williams 1996; Gallici et al. 2024",
+    settings=RolloutSettings,
+    build=_build,
+    experience="rollouts",
+    traits=lambda s: Traits(s.learning_rate, s.optimiser == "sgd", s.lambda_, s.target_period_updates),
+    normalises=lambda s: (s.normalise_observations, False),
+)

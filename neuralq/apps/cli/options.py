@@ -224,8 +224,9 @@ def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
     add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
     add("--hook", type=str, metavar="module:name", help="function or class of your own that takes every row of metrics")
     add("--json", action="store_true", help="print the result as one JSON object on the last line")
-    group = parser.add_argument_group(f"options of the {learner} learner")
-    _add_fields(group, LEARNERS[learner], f"{learner}.", preset.get(learner, {}))
+    kind = LEARNERS[learner]
+    group = parser.add_argument_group(f"options of the {learner} learner", f"{kind.title}: {kind.source}")
+    _add_fields(group, kind.settings, f"{learner}.", preset.get(learner, {}))
     return parser
 
 

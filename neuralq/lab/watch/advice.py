@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from neuralq.checks import check_discount, check_fraction, check_positive
 from neuralq.lab.networks.sampled import SampleDiagnosis
-from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, StreamingSettings
 from neuralq.runs import RunConfig
 
 __all__ = ["RunTraits", "advise"]
@@ -55,30 +54,10 @@ class RunTraits:
             >>> RunTraits.of(RunConfig(learner="online")).plain_steps
             True
         """
-        settings = config.settings
         network = config.layout not in ("table", "linear")
         layer_norm = (config.body is not None and config.body.layer_norm) if network else None
-        gamma, scale = config.gamma, config.reward_scale
-        if isinstance(settings, OnlineSettings):
-            return cls(gamma, settings.step_size, True, settings.lambda_, None, layer_norm, reward_scale=scale)
-        if isinstance(settings, StreamingSettings):  # its steps are bounded
-            return cls(gamma, settings.eta_or_alpha, False, settings.lambda_, None, layer_norm, reward_scale=scale)
-        if isinstance(settings, GradientSettings):
-            decay = settings.rule.lambda_
-            return cls(gamma, settings.step_size, True, decay, None, layer_norm, reward_scale=scale)
-        replay = isinstance(settings, ReplaySettings)
-        one_step = isinstance(settings, ReplaySettings) and settings.block_length == 1
-        return cls(
-            gamma,
-            settings.learning_rate,
-            settings.optimiser == "sgd",
-            0.0 if one_step else settings.lambda_,
-            settings.target_period_updates,
-            layer_norm,
-            replay,
-            isinstance(settings, ReplaySettings) and settings.target_rule == "double",
-            scale,
-        )
+        own = asdict(config.kind.traits(config.settings))
+        return cls(gamma=config.gamma, layer_norm=layer_norm, reward_scale=config.reward_scale, **own)
 
 
 def advise(traits: RunTraits, diagnosis: SampleDiagnosis | None = None) -> tuple[str, ...]:

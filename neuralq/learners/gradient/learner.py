@@ -30,7 +30,7 @@ from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
 from neuralq.learners.learner import Update
-from neuralq.q.engine import Engine
+from neuralq.q.engine import Engine, MlpEngine
 from neuralq.types import Transition
 
 __all__ = ["GradientPredictionLearner", "GradientQLearner"]
@@ -186,6 +186,11 @@ class GradientQLearner:
     def num_updates(self) -> int:
         """Updates so far."""
         return self._core.num_updates
+
+    @property
+    def engine_name(self) -> str:
+        """What computes: "torch", or where there are kernels for values "compiled and torch"."""
+        return "compiled and torch" if isinstance(self.engine, MlpEngine) else "torch"
 
     def _keep(self, transition: Transition, like: Tensor) -> Tensor:
         """How much of the older traces survives the action taken, ``[N]``."""

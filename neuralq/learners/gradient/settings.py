@@ -1,14 +1,25 @@
-"""What a run by gradient TD may be told: QRC(λ) with its published numbers, or GQ(λ)."""
+"""Runs by gradient TD: what they may be told, QRC(λ) with its published numbers or GQ(λ), and how they are made."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
+
+import torch
+from torch import nn
 
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners.gradient.correction import HeadCorrection, TangentCorrection
+from neuralq.learners.gradient.learner import GradientQLearner
 from neuralq.learners.gradient.step import GradientTDSettings
+from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits
+from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, MaskedQ, SeparateQ
+from neuralq.q.engine import Engine
+from neuralq.rules import epsilon_greedy
+from neuralq.types import QFunction
 
-__all__ = ["GradientSettings"]
+__all__ = ["GRADIENT", "GradientSettings", "gradient_learner", "started_at_zero"]
 
 
 @dataclass(frozen=True)
@@ -87,3 +98,67 @@ class GradientSettings:
         return GradientTDSettings(
             "tdc", self.lambda_, self.step_size, self.step_size_h, self.beta, self.cut or "watkins"
         )
+
+
+def started_at_zero(q: QFunction) -> QFunction:
+    """``q`` itself with all its values 0: a table or linear function at 0, a network with its last layer at 0.
+
+    The layers below keep the weights they were drawn with, so that a network has something to learn from.
+
+    Example:
+        >>> from neuralq.q import MLP
+        >>> started_at_zero(ActionOutputQ((4,), 2, MLP((8,)), rng=0)).all(torch.ones(4)).tolist()
+        [0.0, 0.0]
+    """
+    inner: Any = q.inner if isinstance(q, MaskedQ) else q
+    if isinstance(inner, DuelingQ):
+        last: list[nn.Module] = [inner.value.layers[-1], inner.advantage.layers[-1]]
+    elif isinstance(inner, ActionInputQ | SeparateQ | ActionOutputQ):
+        last = [cast(Any, inner.trunk).layers[-1]]
+    else:
+        last = [inner]
+    for module in last:
+        for p in module.parameters():
+            p.data = torch.zeros_like(p)
+    return q
+
+
+def gradient_learner(
+    engine: Engine, settings: GradientSettings, head: QFunction, reward_scale: float = 1.0
+) -> GradientQLearner:
+    """QRC(λ) with ``head`` for its second function; GQ(λ) finds its own in the tangent space of the values.
+
+    Example:
+        >>> from neuralq.q import TableQ
+        >>> from neuralq.q.engine import Loss, TorchEngine
+        >>> gradient_learner(TorchEngine(TableQ(2, 2), Loss()), GradientSettings(), TableQ(2, 2)).num_updates
+        0
+    """
+    if settings.method == "qrc":
+        return GradientQLearner(engine, HeadCorrection(head), settings.rule, 1, reward_scale)
+    policy = partial(epsilon_greedy, epsilon=settings.target_epsilon or 0.0)
+    return GradientQLearner(engine, TangentCorrection(engine), settings.rule, 1, reward_scale, policy)
+
+
+def _build(parts: Parts) -> GradientQLearner:
+    return gradient_learner(parts.engine, parts.settings, started_at_zero(parts.another()), parts.reward_scale)
+
+
+def _check(settings: GradientSettings, representation: Representation) -> None:
+    if representation.engine == "compiled":
+        raise ValueError(
+            "engine='compiled' has no kernels for gradient TD, whose steps need three gradients; use engine='auto'"
+        )
+
+
+GRADIENT = LearnerKind(
+    name="gradient",
+    title="gradient TD: QRC(λ), or GQ(λ)",
+    source="Maei & Sutton 2010; Elelimy et al. 2025",
+    settings=GradientSettings,
+    build=_build,
+    experience="steps",
+    traits=lambda s: Traits(s.step_size, lambda_=s.rule.lambda_),
+    normalises=lambda s: (s.normalise_observations, s.scale_rewards),
+    check=_check,
+)

@@ -28,12 +28,29 @@ from neuralq.learners.gradient.differentiation import gradient, greedy_value, mo
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.q.bodies import Trunk
-from neuralq.q.engine import Engine
+from neuralq.q.engine import Engine, MlpEngine
 from neuralq.q.masked import MaskedQ
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import QFunction, Transition
 
-__all__ = ["DQRCLearner", "DQRCSettings", "TwinHead"]
+__all__ = ["DQRCLearner", "DQRCSettings", "TwinHead", "has_hidden_units"]
+
+
+def _trunk_of(q: QFunction) -> Trunk | None:
+    """The dense layers of a network, None where there are none: a table or a linear function."""
+    trunk = getattr(q.inner if isinstance(q, MaskedQ) else q, "trunk", None)
+    return trunk if isinstance(trunk, Trunk) else None
+
+
+def has_hidden_units(q: QFunction) -> bool:
+    """Whether there are hidden units that a second function could share, as there are in a network.
+
+    Example:
+        >>> from neuralq.q import ActionOutputQ, TableQ
+        >>> has_hidden_units(TableQ(3, 2)), has_hidden_units(ActionOutputQ((4,), 2))
+        (False, True)
+    """
+    return _trunk_of(q) is not None
 
 
 class TwinHead(nn.Module):
@@ -54,9 +71,9 @@ class TwinHead(nn.Module):
 
     def __init__(self, q: QFunction) -> None:
         super().__init__()
-        inner = q.inner if isinstance(q, MaskedQ) else q
-        trunk = getattr(inner, "trunk", None)
-        if not isinstance(trunk, Trunk):
+        trunk = _trunk_of(q)
+        if trunk is None:
+            inner = q.inner if isinstance(q, MaskedQ) else q
             raise ValueError(
                 f"{type(inner).__name__} has no hidden units to share; hand in a function of its own, such as another "
                 f"{type(inner).__name__}"
@@ -160,6 +177,11 @@ class DQRCLearner:
         self._parameters_h = module_parameters(head)
         self._state = FlatOptimiser(Optimiser(settings.optimiser), engine.flat.values)
         self._state_h = FlatOptimiser(Optimiser(settings.optimiser), self._correction.values)
+
+    @property
+    def engine_name(self) -> str:
+        """What computes: "torch", or where there are kernels for values "compiled and torch"."""
+        return "compiled and torch" if isinstance(self.engine, MlpEngine) else "torch"
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One step of both functions on a batch; ``weight`` ``[B]`` multiplies each sample's losses."""

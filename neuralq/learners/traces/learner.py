@@ -17,13 +17,14 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
 from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
 from neuralq.types import Transition
 
-__all__ = ["OnlineLearner", "OnlineSettings", "PredictionLearner"]
+__all__ = ["ONLINE", "OnlineLearner", "OnlineSettings", "PredictionLearner"]
 
 
 @dataclass(frozen=True)
@@ -302,3 +303,14 @@ class PredictionLearner:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
         self._core.load_state_dict(state)
+
+
+ONLINE = LearnerKind(
+    name="online",
+    title="Q(λ) with eligibility traces, step by step",
+    source="Watkins 1989; van Seijen & Sutton 2014",
+    settings=OnlineSettings,
+    build=lambda parts: OnlineLearner(parts.engine, parts.settings, 1, parts.reward_scale),
+    experience="steps",
+    traits=lambda s: Traits(s.step_size, lambda_=s.lambda_),
+)

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive
+from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.traces import streaming_kernels as kernels
 from neuralq.learners.traces.single_row import SingleRowNetwork, runs_single_row
@@ -34,7 +35,7 @@ from neuralq.q.engine import Engine
 from neuralq.rules import streaming as bounds
 from neuralq.types import Transition
 
-__all__ = ["StreamingLearner", "StreamingSettings"]
+__all__ = ["STREAMING", "StreamingLearner", "StreamingSettings"]
 
 _BOUNDS = ("obgd", "adaptive-obgd", "intentional")
 
@@ -296,3 +297,20 @@ class StreamingLearner:
         self._steps.num_updates = int(state["num_updates"])
         self.engine.flat.load(torch.as_tensor(state["parameters"]))
         self._steps.load_state_dict(state["steps"])
+
+
+def _build(parts: Parts) -> StreamingLearner:
+    kernels = "auto" if parts.kernels == "compiled" else parts.kernels  # on other devices torch stands in
+    return StreamingLearner(parts.engine, parts.settings, parts.discount, parts.reward_scale, kernels)
+
+
+STREAMING = LearnerKind(
+    name="streaming",
+    title="Q(λ) on one stream, each step bounded by what it would do (Stream Q(λ))",
+    source="Elsayed, Vasan & Mahmood 2024",
+    settings=StreamingSettings,
+    build=_build,
+    experience="steps",
+    traits=lambda s: Traits(s.eta_or_alpha, plain_steps=False, lambda_=s.lambda_),
+    normalises=lambda s: (s.normalise_observations, s.scale_rewards),
+)

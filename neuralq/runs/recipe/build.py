@@ -1,4 +1,7 @@
-"""From a configuration to the parts of a run: environments, representation, learner, feed and behaviour."""
+"""From a configuration to the parts of a run: environments, representation, learner, experience and behaviour.
+
+What a learner needs is asked of its record (`neuralq.learners.LearnerKind`); nothing here knows one by name.
+"""
 
 from __future__ import annotations
 
@@ -12,32 +15,18 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from neuralq.learners import (
-    GradientSettings,
-    Learner,
-    OnlineLearner,
-    OnlineSettings,
-    ReplayLearner,
-    ReplaySettings,
-    RolloutLearner,
-    RolloutSettings,
-    StreamingLearner,
-    StreamingSettings,
-)
-from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners import HasEngineName, HasValues, Learner, Parts
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
-from neuralq.q.engine import Engine, Loss, MlpEngine, array_values, make_engine
+from neuralq.q.engine import Engine, MlpEngine, array_values, make_engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
 from neuralq.runs.folder.env_probe import is_resumable
 from neuralq.runs.loop import Plan, Session, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, register_games
-from neuralq.runs.recipe.gradient import gradient_learner, started_at_zero
-from neuralq.runs.recipe.replay import as_distribution, num_atoms, replay_learner
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
-from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_epsilon_greedy
+from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience, StepExperience
 from neuralq.types import QFunction, Transition
@@ -102,17 +91,17 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     q: QFunction
     shape, num_categories = spec.inner_shape, spec.num_categories
     features: nn.Module | None = None
-    num_outputs = spec.num_actions * num_atoms(config)
-    if config.layout == "table":
-        if num_categories is None:
-            raise ValueError("a table needs finitely many states; choose another layout")
-        q = as_distribution(config, TableQ(num_categories, num_outputs))
-        return MaskedQ(q, shape) if spec.masked else q
-    if num_categories is not None:
+    per_action = config.kind.outputs(config.settings, config.layout)
+    num_outputs = spec.num_actions * per_action
+    if num_categories is not None and config.layout != "table":
         features, shape = OneHot(num_categories), (num_categories,)
     elif spec.dtype == np.uint8:
         features = Pixels()
-    if config.layout == "linear":
+    if config.layout == "table":
+        if num_categories is None:
+            raise ValueError("a table needs finitely many states; choose another layout")
+        q = TableQ(num_categories, num_outputs)
+    elif config.layout == "linear":
         flat = features
         if len(shape) > 1:
             flat = nn.Sequential(*([] if features is None else [features]), nn.Flatten(-len(shape)))
@@ -121,10 +110,10 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     else:
         body = config.body or body_for(shape, is_frame=spec.dtype.kind in "bu")
         if config.dueling:
-            q = DuelingQ(shape, spec.num_actions, body, features, rng, num_atoms=num_atoms(config))
+            q = DuelingQ(shape, spec.num_actions, body, features, rng, num_atoms=per_action)
         else:
             q = _NETWORKS[config.layout](shape, num_outputs, body, features, rng)
-    q = as_distribution(config, q)
+    q = config.kind.represent(q, config.settings, config.reward_scale, rng)
     return MaskedQ(q, spec.inner_shape) if spec.masked else q
 
 
@@ -134,21 +123,22 @@ def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Norm
     Raises:
         ValueError: where state indices would have to be normalised.
     """
-    settings = config.settings
-    if not isinstance(settings, StreamingSettings | GradientSettings | RolloutSettings):
-        return None
-    if isinstance(settings, RolloutSettings) and not settings.normalise_observations:
+    wanted, rewards = config.kind.normalises(config.settings)
+    if wanted is False and not rewards:
         return None
     encoder = encoder_for(envs.single_observation_space, as_index=config.layout == "table")
     is_index = encoder.num_categories is not None
-    if is_index and settings.normalise_observations:
+    if is_index and wanted:
         raise ValueError("state indices have no mean to subtract; leave normalise_observations out")
-    observations = not is_index if settings.normalise_observations is None else settings.normalise_observations
-    rewards = not isinstance(settings, RolloutSettings) and settings.scale_rewards
+    observations = not is_index if wanted is None else wanted
     if not observations and not rewards:
         return None
-    num_envs = getattr(settings, "num_envs", 1)  # as in training, also where one environment is made to play
-    return Normalisation(encoder.shape, config.gamma, num_envs, observations, rewards)
+    # Of as many environments as in training, also where one is made to play.
+    return Normalisation(encoder.shape, config.gamma, _num_envs(config), observations, rewards)
+
+
+def _num_envs(config: RunConfig) -> int:
+    return getattr(config.settings, "num_envs", 1)
 
 
 def build_session(config: RunConfig) -> Session:
@@ -158,23 +148,17 @@ def build_session(config: RunConfig) -> Session:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
     _check_device(config.device)
-    settings = config.settings
-    num_envs = getattr(settings, "num_envs", 1)
+    settings, num_envs = config.settings, _num_envs(config)
     envs = make_envs(config, num_envs, training=True)
     as_index = config.layout == "table"
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
-    q = build_q(config, stream.spec, np.random.default_rng(seed_for(config.seed, 3)))
-    if isinstance(q, nn.Module):
-        q.to(config.device)
-    loss = Loss("huber" if isinstance(settings, ReplaySettings) and settings.loss == "huber" else "squared")
-    engine = make_engine(q, loss, config.engine)
+    engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(settings), config.engine)
     learner = _learner(config, engine, stream.spec, generators["samples"])
-    experience = _experience(config, stream.spec, num_envs, generators["samples"])
+    experience = _SOURCES[config.kind.experience](settings, stream.spec, generators["samples"])
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
-    values = learner.values if isinstance(learner, StreamingLearner) else engine.all
-    arrays = None if isinstance(learner, StreamingLearner) else array_values(engine)
+    values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     evaluation_envs = make_envs(config, config.evaluation_episodes)
     frozen = None if normalisation is None else normalisation.frozen()
@@ -184,9 +168,7 @@ def build_session(config: RunConfig) -> Session:
         seed_for(config.seed, 5),
         np.random.default_rng(seed_for(config.seed, 6)),
     )
-    _warm(engine, stream, settings)
-    if isinstance(settings, StreamingSettings):
-        _warm_streaming(config, engine, stream)
+    _warm(config, engine, stream)
     return Session(stream, policy, experience, learner, generators, evaluation, probe)
 
 
@@ -196,11 +178,9 @@ def engine_name(learner: Learner) -> str:
     Kernels know tables, linear functions and convolutions only in part; where they know nothing torch steps in, and a
     run should be able to say so.
     """
-    if isinstance(learner, StreamingLearner):
+    if isinstance(learner, HasEngineName):
         return learner.engine_name
-    if not isinstance(learner.engine, MlpEngine):
-        return "torch"
-    return "compiled" if isinstance(learner, RolloutLearner | ReplayLearner | OnlineLearner) else "compiled and torch"
+    return "compiled" if isinstance(learner.engine, MlpEngine) else "torch"
 
 
 def _check_device(device: str) -> None:
@@ -213,79 +193,69 @@ def _check_device(device: str) -> None:
         raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works")
 
 
+def _q_on_device(config: RunConfig, spec: ObservationSpec, purpose: int) -> QFunction:
+    q = build_q(config, spec, np.random.default_rng(seed_for(config.seed, purpose)))
+    if isinstance(q, nn.Module):
+        q.to(config.device)
+    return q
+
+
 def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.random.Generator) -> Learner:
-    settings = config.settings
-    if isinstance(settings, RolloutSettings):
-        rows = settings.num_envs * settings.num_steps
-        total = -(-(settings.anneal_env_steps or config.total_steps) // rows) if settings.anneal else None
-        return RolloutLearner(engine, settings, rng, config.reward_scale, total)
-    if isinstance(settings, ReplaySettings):
-        return replay_learner(config, engine)
-    if isinstance(settings, StreamingSettings):
-        return StreamingLearner(engine, settings, config.gamma, config.reward_scale, _kernels(config))
-    if isinstance(settings, GradientSettings):
-        head = started_at_zero(build_q(config, spec, np.random.default_rng(seed_for(config.seed, 11))))
-        if isinstance(head, nn.Module):
-            head.to(config.device)
-        return gradient_learner(engine, settings, head, config.reward_scale)
-    return OnlineLearner(engine, settings, 1, config.reward_scale)
+    parts = Parts(
+        engine, config.settings, rng, config.gamma, config.reward_scale, config.total_steps, config.engine,
+        another=lambda: _q_on_device(config, spec, 11),
+    )  # fmt: skip
+    return config.kind.build(parts)
 
 
-def _kernels(config: RunConfig) -> str:
-    return "auto" if config.engine == "compiled" else config.engine
+def _rollouts(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
+    return RolloutExperience(settings.num_steps, settings.num_envs, spec)
 
 
-def _experience(config: RunConfig, spec: ObservationSpec, num_envs: int, rng: np.random.Generator) -> ExperienceSource:
-    settings = config.settings
-    if isinstance(settings, RolloutSettings):
-        return RolloutExperience(settings.num_steps, num_envs, spec)
-    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
-        return StepExperience(num_envs, spec)
-    buffer = _buffer(settings, spec, settings.capacity)
+def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
     return ReplayExperience(
-        buffer, rng, settings.batch_size, settings.block_length, settings.learning_starts, settings.train_period,
-        settings.updates_per_period,
+        _buffer(settings, spec, settings.capacity), rng, settings.batch_size, settings.block_length,
+        settings.learning_starts, settings.train_period, settings.updates_per_period,
     )  # fmt: skip
 
 
-def _buffer(settings: ReplaySettings, spec: ObservationSpec, capacity: int) -> ReplayBuffer:
+def _steps(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
+    return StepExperience(getattr(settings, "num_envs", 1), spec)
+
+
+_SOURCES = {"rollouts": _rollouts, "replay": _replay, "steps": _steps}
+
+
+def _buffer(settings: Any, spec: ObservationSpec, capacity: int) -> ReplayBuffer:
     return ReplayBuffer(
         capacity, spec.shape, spec.dtype, num_envs=settings.num_envs, num_steps=settings.num_steps,
         prioritised=Prioritised() if settings.prioritised else None,
     )  # fmt: skip
 
 
-def _warm(engine: Engine, stream: Interaction, settings: object) -> None:
-    """Compile, or load from the cache, every kernel the run will call, so that its clock measures training."""
+def _warm(config: RunConfig, engine: Engine, stream: Interaction) -> None:
+    """Compile, or load from the cache, every kernel the run will call, so that its clock measures training.
+
+    A learner like the run's, on a copy of the representation, learns once from a made-up step and is thrown away.
+    """
+    settings, experience = config.settings, config.kind.experience
     s = torch.from_numpy(stream.state_dict()["s"])
-    q = engine.all(s)
-    a, _ = choose_epsilon_greedy(q, 0.5, np.full(len(s), 0.5))
-    if isinstance(settings, OnlineSettings | StreamingSettings | GradientSettings):
-        return
-    engine.loss_gradient(s, a.to(q.device), torch.zeros(len(s), dtype=q.dtype, device=q.device))
-    engine.flat.grad.zero_()
-    throwaway = torch.ones(2, dtype=q.dtype, device=q.device)
-    assert isinstance(settings, RolloutSettings | ReplaySettings)
-    FlatOptimiser(Optimiser(settings.optimiser), throwaway).step(throwaway.clone(), 0.0)
-    clip_norm_(throwaway, 0.5)
-    if isinstance(settings, ReplaySettings):
+    a, _ = choose_greedy(engine.all(s))
+    one = torch.ones(len(s))
+    step = Transition(s, a, one, one, one, s, one > 0).map(lambda x: x.to(config.device))
+    twin = make_engine(copy.deepcopy(engine.q), config.kind.loss(settings), config.engine)
+    learner = _learner(config, twin, stream.spec, np.random.default_rng(0))
+    if isinstance(learner, HasValues):
+        learner.values(step.s_tm1)
+    time_major = experience == "rollouts" or getattr(settings, "block_length", 1) > 1
+    learner.update(step.map(lambda x: x[None]) if time_major else step)
+    if experience == "replay":
         _warm_buffer(_buffer(settings, stream.spec, 8 * settings.num_envs), stream, settings)
-
-
-def _warm_streaming(config: RunConfig, engine: Engine, stream: Interaction) -> None:
-    """A step of a learner that is thrown away."""
-    s = torch.from_numpy(stream.state_dict()["s"]).to(config.device)
-    a, one = torch.zeros(1, dtype=torch.int64, device=config.device), torch.ones(1, device=config.device)
-    twin = make_engine(copy.deepcopy(engine.q), Loss("squared"), config.engine)
-    learner = StreamingLearner(twin, config.settings, config.gamma, 1.0, _kernels(config))  # type: ignore[arg-type]
-    learner.values(s)
-    learner.update(Transition(s, a, one, one, one, s, one > 0))
     if stream.normalisation is not None:
-        same = Normalisation((2,), 0.5, 1)
-        same.reward(np.ones(1), np.zeros(1, bool), np.ones(1, bool))
+        Normalisation((2,), 0.5, 1).reward(np.ones(1), np.zeros(1, bool), np.ones(1, bool))
 
 
-def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: ReplaySettings) -> None:
+def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: Any) -> None:
     s = stream.state_dict()["s"]
     rng = np.random.default_rng(0)
     env_indices = range(settings.num_envs)

@@ -7,39 +7,51 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from numbers import Real
 from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
-from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import MLP, NAMED_BODIES, Body, Conv, Custom
 from neuralq.runs.recipe.games import is_screen
 
 __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict"]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
-Settings = RolloutSettings | ReplaySettings | OnlineSettings | StreamingSettings | GradientSettings
-LEARNERS: dict[str, type[Settings]] = {
-    "rollout": RolloutSettings,
-    "replay": ReplaySettings,
-    "online": OnlineSettings,
-    "streaming": StreamingSettings,
-    "gradient": GradientSettings,
-}
+LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
 BODIES: dict[str, type[MLP] | type[Conv] | type[Custom]] = {"MLP": MLP, "Conv": Conv, "Custom": Custom}
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
+_Class = TypeVar("_Class")
+
+if TYPE_CHECKING:
+    from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+
+
+def _with_learners(cls: type[_Class]) -> type[_Class]:
+    """A field for the settings of every learner, where the class says ``learners``."""
+    hints: dict[str, Any] = {}
+    for name, hint in cls.__annotations__.items():
+        hints |= {k: kind.settings | None for k, kind in LEARNERS.items()} if name == "learners" else {name: hint}
+    for name in LEARNERS:
+        setattr(cls, name, None)
+    cls.__annotations__ = hints
+    return cls
 
 
 @dataclass(frozen=True)
+@_with_learners
 class RunConfig:
     """Everything that decides a run.
+
+    Besides the arguments below there is one for every learner, of its name, which takes its settings:
+    ``RunConfig(learner="replay", replay=ReplaySettings(num_steps=3))``. It goes with that learner only.
 
     Args:
         env: Gymnasium id, or "module:id" to import a module that registers it.
         env_kwargs: passed to `gymnasium.make`.
         clip_rewards: whether training sees rewards clipped to between −1 and 1 (Mnih et al., 2015); Atari screens only.
         end_on_life_loss: whether in training a lost life ends the game and begins another; Atari screens only.
-        learner: "rollout", "replay", "online", "streaming" or "gradient".
+        learner: name of a learner; `neuralq.learners.learner_kinds` has them all.
         layout: "table", "linear", "action-input", "separate" or "action-output".
         seed: from which every generator is derived.
         total_steps: environment steps, summed over parallel environments.
@@ -52,11 +64,6 @@ class RunConfig:
         body: network body, MLP, Conv or Custom (a module of your own); networks only. None picks MLP, or Conv for
             images.
         dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
-        rollout: settings of the rollout learner; only with ``learner="rollout"``.
-        replay: settings of the replay learner; only with ``learner="replay"``.
-        online: settings of the online learner; only with ``learner="online"``.
-        streaming: settings of the streaming learner; only with ``learner="streaming"``.
-        gradient: settings of the gradient-TD learner; only with ``learner="gradient"``.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
         evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
@@ -83,11 +90,14 @@ class RunConfig:
     epsilon_decay_steps: int = 20_000
     body: MLP | Conv | Custom | None = None
     dueling: bool = False
-    rollout: RolloutSettings | None = None
-    replay: ReplaySettings | None = None
-    online: OnlineSettings | None = None
-    streaming: StreamingSettings | None = None
-    gradient: GradientSettings | None = None
+    if TYPE_CHECKING:  # which learners there are is found out when the program runs; type checkers know ours
+        gradient: GradientSettings | None = None
+        online: OnlineSettings | None = None
+        replay: ReplaySettings | None = None
+        rollout: RolloutSettings | None = None
+        streaming: StreamingSettings | None = None
+    else:
+        learners: None
     evaluate_every: int = 4096
     evaluation_episodes: int = 20
     evaluation_max_steps: int = 10_000
@@ -122,10 +132,10 @@ class RunConfig:
             "epsilon_decay_steps",
         ):
             check_whole(name, getattr(self, name))
-        for name, settings in LEARNERS.items():
+        for name, kind in LEARNERS.items():
             given = getattr(self, name)
             if name == self.learner and given is None:
-                object.__setattr__(self, name, settings())
+                object.__setattr__(self, name, kind.settings())
             elif name != self.learner and given is not None:
                 raise ValueError(
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
@@ -133,13 +143,18 @@ class RunConfig:
                 )
         _check_body(self)
         _check_outputs(self)
+        self.kind.check(self.settings, self)
         _check_game(self)
 
     @property
-    def settings(self) -> Settings:
+    def kind(self) -> LearnerKind:
+        """The record of the learner that runs."""
+        return LEARNERS[self.learner]
+
+    @property
+    def settings(self) -> Any:
         """The settings of the learner that runs."""
-        chosen: Settings = getattr(self, self.learner)
-        return chosen
+        return getattr(self, self.learner)
 
 
 def _check_body(config: RunConfig) -> None:
@@ -149,15 +164,10 @@ def _check_body(config: RunConfig) -> None:
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
     if config.engine == "compiled" and (config.layout not in NETWORKS or isinstance(config.body, Conv | Custom)):
         raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
-    if config.engine == "compiled" and config.learner == "gradient":
-        raise ValueError(
-            "engine='compiled' has no kernels for gradient TD, whose steps need three gradients; use engine='auto'"
-        )
 
 
 def _check_outputs(config: RunConfig) -> None:
-    """Dueling streams and distributions are made of several outputs, which not every layout has."""
-    distribution = "none" if config.replay is None else config.replay.distribution
+    """Dueling streams are made of the outputs of all actions, which not every layout has."""
     if config.dueling and config.layout != "action-output":
         why = {
             "action-input": "an action-input network sees one action at a time and has no average over them",
@@ -166,22 +176,12 @@ def _check_outputs(config: RunConfig) -> None:
         raise ValueError(f"dueling needs layout='action-output', got {config.layout!r}: {why}")
     if config.dueling and config.body is not None and not config.body.hidden:
         raise ValueError("dueling streams need a hidden layer, got a body with hidden=(); give it a width")
-    if distribution != "none" and config.layout in ("action-input", "separate"):
-        raise ValueError(
-            f"distribution={distribution!r} needs several outputs per action, and {config.layout} networks have one "
-            "output each; use layout='action-output', 'linear' or 'table'"
-        )
     if config.layout == "action-input" and isinstance(config.body, Custom) and not config.body.hidden:
         raise ValueError(
             "without a layer after it the action would be added to what the body says of the state, and one action be "
             "best everywhere; give the body hidden=(width,), or use another layout"
         )
-    if config.dueling and config.replay is not None and config.replay.target_rule == "dqrc":
-        raise ValueError(
-            "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
-            "leave dueling out"
-        )
-    if config.engine == "compiled" and (config.dueling or distribution != "none"):
+    if config.engine == "compiled" and config.dueling:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
@@ -228,14 +228,14 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     if values.get("kind") == "td-gammon":
         raise ValueError("this is the configuration of a TD-Gammon run; neuralq.systems.backgammon.config reads those")
     _refuse_unknown("the configuration", values, RunConfig)
-    for name, settings in LEARNERS.items():
+    for name, kind in LEARNERS.items():
         if values.get(name) is not None:
-            values[name] = settings(**_fitted(name, values[name], settings))
+            values[name] = kind.settings(**_fitted(name, values[name], kind.settings))
     if values.get("body") is not None:
         body = _body_of(values["body"])
         check_choice("class of the body", body.get("class"), BODIES)
-        kind = BODIES[body.pop("class")]
-        values["body"] = kind(**_fitted("body", body, kind))
+        body_class = BODIES[body.pop("class")]
+        values["body"] = body_class(**_fitted("body", body, body_class))
     return RunConfig(**values)
 
 
