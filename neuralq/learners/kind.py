@@ -115,6 +115,7 @@ class LearnerKind:
         outputs: ``outputs(settings, layout)``: how many numbers the representation has for every action.
         represent: the Q-function that those outputs describe: ``represent(q, settings, reward_scale, rng)``.
         check: ``check(settings, representation)`` raises a `ValueError` with the way out where they do not go together.
+        place: where it stands in lists; those of one number by name.
     """
 
     name: str
@@ -129,6 +130,7 @@ class LearnerKind:
     outputs: Callable[[Any, str], int] = lambda settings, layout: 1
     represent: Callable[[QFunction, Any, float, np.random.Generator], QFunction] = _as_it_is
     check: Callable[[Any, Representation], None] = _anything
+    place: int = 100
 
     def __post_init__(self) -> None:
         """Refuse experience that no run hands out."""

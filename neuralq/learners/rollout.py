@@ -241,4 +241,5 @@ ROLLOUT = LearnerKind(
     experience="rollouts",
     traits=lambda s: Traits(s.learning_rate, s.optimiser == "sgd", s.lambda_, s.target_period_updates),
     normalises=lambda s: (s.normalise_observations, False),
+    place=1,
 )

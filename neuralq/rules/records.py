@@ -13,16 +13,21 @@ from typing import Protocol, TypeVar
 __all__ = ["discovered"]
 
 
-class _Named(Protocol):
+class _Listed(Protocol):
     @property
     def name(self) -> str: ...
 
+    @property
+    def place(self) -> int: ...
 
-Record = TypeVar("Record", bound=_Named)
+
+Record = TypeVar("Record", bound=_Listed)
 
 
 def discovered(package: str, kind: type[Record]) -> dict[str, Record]:
-    """The records of one kind in every module of a package and of the packages in it, by name in alphabetical order.
+    """The records of one kind in every module of a package and of the packages in it, by name.
+
+    They come in the order of their places, those of one place in that of the alphabet.
 
     Args:
         package: dotted name; every module below it is imported. A folder of one's own joins by its ``__path__``.
@@ -44,4 +49,4 @@ def discovered(package: str, kind: type[Record]) -> dict[str, Record]:
                     f"two records of {kind.__name__} are named {record.name!r}, the second in {module.name}; "
                     "give one of them another name"
                 )
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items(), key=lambda item: (item[1].place, item[0])))

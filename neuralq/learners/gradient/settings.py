@@ -161,4 +161,5 @@ GRADIENT = LearnerKind(
     traits=lambda s: Traits(s.step_size, lambda_=s.rule.lambda_),
     normalises=lambda s: (s.normalise_observations, s.scale_rewards),
     check=_check,
+    place=5,
 )

@@ -80,4 +80,5 @@ REPLAY = LearnerKind(
     outputs=lambda s, layout: s.num_atoms or 1,
     represent=_represent,
     check=_check,
+    place=2,
 )

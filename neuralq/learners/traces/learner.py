@@ -313,4 +313,5 @@ ONLINE = LearnerKind(
     build=lambda parts: OnlineLearner(parts.engine, parts.settings, 1, parts.reward_scale),
     experience="steps",
     traits=lambda s: Traits(s.step_size, lambda_=s.lambda_),
+    place=3,
 )
