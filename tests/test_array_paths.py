@@ -21,7 +21,8 @@ import torch
 
 from neuralq.learners import ReplayLearner, ReplaySettings, RolloutLearner, RolloutSettings
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, MaskedQ, SeparateQ, TableQ
-from neuralq.q.engine import Loss, MlpEngine, TorchEngine, array_values, make_engine, on_arrays
+from neuralq.q.compiled import MlpEngine, array_values, make_engine, on_arrays
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.inputs import OneHot
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy
@@ -146,7 +147,7 @@ def test_a_rollout_learner_learns_the_same(dtype: torch.dtype) -> None:
             held[1, 2] = held[6, 0] = 0
         updates = [learner.update(_batch(step, 7, 3, dtype=dtype), held if step > 1 else None) for learner in learners]
         assert torch.equal(updates[0].errors, updates[1].errors) and torch.equal(updates[0].targets, updates[1].targets)
-        assert torch.equal(learners[0].played(), learners[1].played())
+        assert torch.equal(learners[0].evaluation_parameters(), learners[1].evaluation_parameters())
         assert torch.equal(learners[0].engine.flat.values, learners[1].engine.flat.values)
     nothing = learners[0].update(_batch(9, 7, 3, dtype=dtype), torch.zeros(7, 3))
     assert len(nothing.errors) == 21  # no row is experience: nothing is learned

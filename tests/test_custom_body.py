@@ -19,7 +19,8 @@ from torch import nn
 from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings, RolloutSettings
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Custom, DuelingQ, SeparateQ
-from neuralq.q.engine import Loss, TorchEngine, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs import RunConfig, evaluate_run, load, resume, train
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 
 from neuralq.learners.optim import FlatOptimiser, Optimiser
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
-from neuralq.q.engine import Loss, MlpEngine, TorchEngine, make_engine, runs_compiled
+from neuralq.q.compiled import MlpEngine, make_engine, runs_compiled
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.inputs import OneHot, Pixels
 
 A, D = 3, 4

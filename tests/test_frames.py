@@ -18,10 +18,10 @@ import torch
 from gymnasium import spaces
 
 from neuralq.learners.replay.buffer import ReplayBuffer
-from neuralq.learners.traces.single_row import SingleRowNetwork
 from neuralq.q import MLP, NAMED_BODIES, ActionOutputQ, Conv, SeparateQ, body_for
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.frames import channels_first
+from neuralq.q.single_row import SingleRowNetwork
 from neuralq.runs import RunConfig, train, with_preset
 from neuralq.runs.recipe.build import build_q, build_session, make_envs
 from neuralq.runs.recipe.config import config_from_dict

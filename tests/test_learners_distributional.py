@@ -20,8 +20,9 @@ from neuralq import rules
 from neuralq.learners import DistributionalLearner, ReplayLearner, ReplaySettings
 from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MLP, ActionOutputQ, CategoricalQ, Conv, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
+from neuralq.q.compiled import make_engine
 from neuralq.q.distributional import atoms, distribution_of
-from neuralq.q.engine import Loss, TorchEngine, make_engine
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.types import Transition
 
 F64 = torch.float64

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 
 from neuralq.learners import DQRCLearner, DQRCSettings, TwinHead
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, MaskedQ, SeparateQ, TableQ
-from neuralq.q.engine import Loss, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Loss
 from neuralq.types import Transition
 
 Array = NDArray[np.float64]

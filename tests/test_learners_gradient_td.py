@@ -38,7 +38,8 @@ from neuralq.learners import (
 )
 from neuralq.learners.gradient.differentiation import gradient_rows, module_parameters
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, FlatParameters, LinearQ, MaskedQ, SeparateQ, TableQ
-from neuralq.q.engine import Engine, Loss, TorchEngine, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Engine, Loss, TorchEngine
 from neuralq.types import Transition
 from neuralq_envs.counterexamples import star
 

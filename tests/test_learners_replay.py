@@ -18,7 +18,8 @@ from torch import Tensor
 from neuralq.learners import ReplayLearner, ReplaySettings
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
-from neuralq.q.engine import Engine, Loss, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Engine, Loss
 from neuralq.types import Transition
 
 LAYOUTS = ["table", "linear", "action-input", "separate", "action-output"]

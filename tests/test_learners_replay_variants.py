@@ -28,7 +28,8 @@ from neuralq.learners import (
 )
 from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import MLP, ActionOutputQ, CategoricalQ, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
-from neuralq.q.engine import Loss, MlpEngine, TorchEngine, make_engine
+from neuralq.q.compiled import MlpEngine, make_engine
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs import Run, RunConfig, load, resume, train
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.run_folder import read_metrics

@@ -19,7 +19,8 @@ from torch import Tensor
 from neuralq.learners import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.gradient.residual import adaptive_phi
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
-from neuralq.q.engine import Engine, Loss, TorchEngine, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Engine, Loss, TorchEngine
 from neuralq.types import Transition
 from neuralq_envs.counterexamples import star
 

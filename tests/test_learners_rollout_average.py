@@ -21,7 +21,8 @@ import torch
 from neuralq.learners import RolloutLearner, RolloutSettings
 from neuralq.learners.averaging import IterateAverage, evaluating_with, evaluation_parameters
 from neuralq.q import MLP, ActionOutputQ, TableQ
-from neuralq.q.engine import Loss, TorchEngine, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs import RunConfig, load, resume, train
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best

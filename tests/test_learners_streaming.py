@@ -21,9 +21,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from neuralq.learners import OnlineSettings, PredictionLearner, StreamingLearner, StreamingSettings
-from neuralq.learners.traces.single_row import SingleRowNetwork, runs_single_row
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, MaskedQ, SeparateQ, TableQ
-from neuralq.q.engine import Loss, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Loss
+from neuralq.q.single_row import SingleRowNetwork, runs_single_row
 from neuralq.rules.streaming import adaptive_obgd, intentional, obgd_step_size
 from neuralq.types import Transition
 

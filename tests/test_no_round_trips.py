@@ -21,7 +21,8 @@ import torch
 from torch import nn
 
 from neuralq.learners import Learner
-from neuralq.q.engine import Loss, make_engine
+from neuralq.q.compiled import make_engine
+from neuralq.q.engine import Loss
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.config import config_from_dict

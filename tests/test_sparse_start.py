@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, SeparateQ
-from neuralq.q.engine import Loss, MlpEngine, TorchEngine
+from neuralq.q.compiled import MlpEngine
+from neuralq.q.engine import Loss, TorchEngine
 
 
 @pytest.mark.parametrize("sparsity", [0.5, 0.9, 0.01])

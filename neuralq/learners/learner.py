@@ -11,7 +11,8 @@ from torch import Tensor
 
 from neuralq.checks import check_positive
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
-from neuralq.q.engine import Engine, on_arrays
+from neuralq.q.compiled import on_arrays
+from neuralq.q.engine import Engine
 from neuralq.types import Array, Metrics, Transition
 
 __all__ = ["Descent", "HasEngineName", "HasValues", "Learner", "Update"]

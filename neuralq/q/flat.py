@@ -51,6 +51,10 @@ class FlatParameters:
             p.grad = self.grad[start:end].view(p.shape)
             start = end
 
+    def offset(self, parameter: Tensor) -> int:
+        """Where one of the module's parameters begins in the vector."""
+        return (parameter.data_ptr() - self.values.data_ptr()) // self.values.element_size()
+
     def sha256(self) -> str:
         """SHA-256 of the vector's bytes (little-endian, in the order of ``module.parameters()``)."""
         return hashlib.sha256(self.values.detach().cpu().contiguous().numpy().tobytes()).hexdigest()

@@ -94,6 +94,7 @@ class Panel:
             ValueError: there is none.
 
         Example:
+            >>> import numpy as np
             >>> panel = Panel("", "", "", (Curve("w", np.zeros(1), np.ones(1)),))
             >>> panel.curve("w").y.tolist()
             [1.0]

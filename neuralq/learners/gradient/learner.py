@@ -30,7 +30,8 @@ from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
 from neuralq.learners.learner import Update
-from neuralq.q.engine import Engine, MlpEngine
+from neuralq.q.compiled import MlpEngine
+from neuralq.q.engine import Engine
 from neuralq.types import Transition
 
 __all__ = ["GradientPredictionLearner", "GradientQLearner"]

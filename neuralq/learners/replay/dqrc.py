@@ -28,7 +28,8 @@ from neuralq.learners.gradient.differentiation import gradient, greedy_value, mo
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.q.bodies import Trunk
-from neuralq.q.engine import Engine, MlpEngine
+from neuralq.q.compiled import MlpEngine
+from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import QFunction, Transition

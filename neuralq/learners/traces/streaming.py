@@ -30,8 +30,8 @@ from neuralq.checks import check_choice, check_discount, check_fraction, check_p
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.traces import streaming_kernels as kernels
-from neuralq.learners.traces.single_row import SingleRowNetwork, runs_single_row
 from neuralq.q.engine import Engine
+from neuralq.q.single_row import SingleRowNetwork, runs_single_row
 from neuralq.rules import streaming as bounds
 from neuralq.types import Transition
 

@@ -24,12 +24,24 @@ from neuralq.jit import reassociating_kernel
 from neuralq.q.kernels.products import multiply, suits
 from neuralq.types import Array
 
-__all__ = ["ACTION_INPUT", "ACTION_OUTPUT", "HUBER", "SEPARATE", "SQUARED", "VALUE", "all_values", "loss_gradient"]
+__all__ = [
+    "ACTION_INPUT",
+    "ACTION_OUTPUT",
+    "HUBER",
+    "LAYER_NORM_EPS",
+    "SEPARATE",
+    "SQUARED",
+    "VALUE",
+    "all_values",
+    "loss_gradient",
+    "through_activation",
+]
 
 
 ACTION_OUTPUT, SEPARATE, ACTION_INPUT = 0, 1, 2
 SQUARED, HUBER, VALUE = 0, 1, 2
-_LAYER_NORM_EPS = 1e-5  # torch.nn.functional.layer_norm's default
+LAYER_NORM_EPS = 1e-5
+"""As `torch.nn.functional.layer_norm` has it."""
 
 
 @reassociating_kernel
@@ -52,7 +64,7 @@ def _normalise_rows(y: Array, scale: Array, shift: Array, hat: Array, inverse: A
         spread = y[i, 0] * 0
         for j in range(width):
             spread += (y[i, j] - mean) * (y[i, j] - mean)
-        inv = y.dtype.type(1.0 / math.sqrt(spread / width + _LAYER_NORM_EPS))
+        inv = y.dtype.type(1.0 / math.sqrt(spread / width + LAYER_NORM_EPS))
         inverse[i] = inv
         if scale.size > 0:
             for j in range(width):
@@ -124,19 +136,17 @@ def _forward(
 
 
 @reassociating_kernel
-def _through_activation(d: Array, y: Array, activation: int) -> None:
-    """Multiply by the activation's derivative, which all three give from the output alone."""
-    rows, width = d.shape
-    for i in range(rows):
-        if activation == 0:
-            for j in range(width):
-                d[i, j] = d[i, j] if y[i, j] > 0 else d.dtype.type(0)
-        elif activation == 1:
-            for j in range(width):
-                d[i, j] *= d.dtype.type(1) - y[i, j] * y[i, j]
-        else:
-            for j in range(width):
-                d[i, j] = d[i, j] if y[i, j] > 0 else d[i, j] * d.dtype.type(0.01)
+def through_activation(d: Array, y: Array, activation: int) -> None:
+    """Multiply ``d [n]`` by the activation's derivative, which all three give from the output ``y [n]`` alone."""
+    if activation == 0:
+        for j in range(d.size):
+            d[j] = d[j] if y[j] > 0 else d.dtype.type(0)
+    elif activation == 1:
+        for j in range(d.size):
+            d[j] *= d.dtype.type(1) - y[j] * y[j]
+    else:
+        for j in range(d.size):
+            d[j] = d[j] if y[j] > 0 else d[j] * d.dtype.type(0.01)
 
 
 @reassociating_kernel
@@ -186,16 +196,17 @@ def _backward(
     for layer in range(num_layers - 1, -1, -1):
         fan_in, fan_out = plan[layer, 0], plan[layer, 1]
         block = rows * starts[layer]
-        d = deltas[block : block + rows * fan_out].reshape(rows, fan_out)
+        end = block + rows * fan_out
+        d = deltas[block:end].reshape(rows, fan_out)
         if layer < num_layers - 1:
-            _through_activation(d, acts[block : block + rows * fan_out].reshape(rows, fan_out), activation)
+            through_activation(deltas[block:end], acts[block:end], activation)
             if plan[layer, 4] != -1:
                 width = fan_out if plan[layer, 4] >= 0 else 0
                 at = max(plan[layer, 4], 0) + copy * width
                 scale = params[at : at + width]
                 grad_scale = grads[at : at + width]
                 at = max(plan[layer, 5], 0) + copy * width
-                hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
+                hat = hats[block:end].reshape(rows, fan_out)
                 row_inverse = inverse[rows * layer : rows * (layer + 1)]
                 _through_norm(d, hat, row_inverse, scale, grad_scale, grads[at : at + width])
         at = plan[layer, 3] + copy * fan_out
@@ -298,8 +309,8 @@ def loss_gradient(
     acts: Array,
     hats: Array,
     inverse: Array,
-    deltas: Array,
     pairs: Array,
+    deltas: Array,
     spare: Array,
     q_out: Array,
 ) -> int:

@@ -167,6 +167,7 @@ def multiply(
         c_at: where C begins.
 
     Example:
+        >>> import numpy as np
         >>> a, b, c = np.arange(2.0), np.arange(64.0), np.zeros(32)
         >>> multiply(a, 0, 2, 1, 1, 2, b, 0, 32, np.ones(32), 0, c, 0)
         >>> c[:3].tolist()  # 1 + 0·0 + 1·32, …

@@ -18,7 +18,8 @@ from torch import nn
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
-from neuralq.q.engine import Engine, MlpEngine, array_values, make_engine
+from neuralq.q.compiled import MlpEngine, array_values, make_engine
+from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
 from neuralq.runs.folder.env_probe import is_resumable

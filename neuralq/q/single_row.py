@@ -8,9 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq.learners.traces import streaming_kernels as kernels
 from neuralq.q.bodies import ACTIVATIONS, GroupedConv, Trunk
+from neuralq.q.compiled import layer_places
 from neuralq.q.engine import Engine
+from neuralq.q.flat import FlatParameters
+from neuralq.q.kernels import single as kernels
 from neuralq.q.layouts import ActionOutputQ
 from neuralq.types import Transition
 
@@ -51,19 +53,20 @@ class SingleRowNetwork:
             raise ValueError(f"no single-row kernels for {type(q).__name__} as it is; use kind='torch'")
         self._num_actions: int = q.num_actions
         self._shape: tuple[int, ...] = q.input.input_shape
+        self._width = int(np.prod(self._shape))
         self._stem: Any = q.input.stem
         self._dtype: torch.dtype = engine.flat.values.dtype
-        self._activation = list(ACTIVATIONS).index(q.trunk.activation)
+        plan = _plan_of(q, engine.flat)
+        ends = np.cumsum(plan[:, 2])
+        starts = np.concatenate([[0], ends[:-1]])
+        activation = list(ACTIVATIONS).index(q.trunk.activation)
         self._params, self._grads = engine.flat.values.numpy(), engine.flat.grad.numpy()
-        plan = _plan_of(q, engine.flat.values)
-        starts = np.concatenate([[0], np.cumsum(plan[:, 2])]).astype(np.int64)
-        self._plan, self._starts = plan, starts[:-1].copy()
-        self._acts, self._hats, self._deltas = (torch.zeros(int(starts[-1]), dtype=self._dtype).numpy() for _ in "123")
+        self._network: Any = plan, starts, activation
         # Of one convolution at a time: (fan_in of a channel) · (positions).
-        room = int((plan[:, 7] * plan[:, 11] ** 2 * plan[:, 13] * plan[:, 14]).max())
-        self._cols = torch.zeros(room, dtype=self._dtype).numpy()
-        self._inverse = torch.zeros(len(plan), dtype=self._dtype).numpy()
-        self._width = int(np.prod(self._shape))
+        patches = int((plan[:, 7] * plan[:, 11] ** 2 * plan[:, 13] * plan[:, 14]).max())
+        sizes = (int(ends[-1]), int(ends[-1]), len(plan), patches, int(ends[-1]))
+        *work, self._deltas = (torch.zeros(size, dtype=self._dtype).numpy() for size in sizes)
+        self._work: Any = tuple(work)  # acts, hats, inverse, cols
 
     def _rows(self, s: Tensor) -> Any:
         if tuple(s.shape[1:]) != self._shape:
@@ -78,10 +81,8 @@ class SingleRowNetwork:
         """Action values ``[B, *obs] -> [B, A]``."""
         x = self._rows(s)
         out = np.empty((x.shape[0], self._num_actions), x.dtype)
-        kernels.values_of(
-            self._params, self._plan, self._starts, self._activation, x, self._acts, self._hats, self._inverse,
-            self._cols, out,
-        )  # fmt: skip
+        arguments: Any = (self._params, *self._network, x, *self._work, out)
+        kernels.values_of(*arguments)
         return torch.from_numpy(out)
 
     def learn(self, step: Transition, r_t: float, discount_t: float) -> tuple[float, float, bool]:
@@ -93,39 +94,25 @@ class SingleRowNetwork:
         a = int(step.a_tm1.item())
         if not 0 <= a < self._num_actions:
             raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {a}")
-        return kernels.learn(
-            self._params, self._grads, self._plan, self._starts, self._activation, self._rows(step.s_tm1)[0], a, r_t,
-            discount_t, self._rows(step.s_t)[0], self._acts, self._hats, self._inverse, self._deltas,
-            self._cols,
-        )  # fmt: skip
+        rows = self._rows(step.s_tm1)[0], a, r_t, discount_t, self._rows(step.s_t)[0]
+        arguments: Any = (self._params, self._grads, *self._network, *rows, *self._work, self._deltas)
+        return kernels.learn(*arguments)
 
 
-def _plan_of(q: ActionOutputQ, values: Tensor) -> Any:
-    """One row per layer; the columns are explained in `neuralq.learners.traces.streaming_kernels`."""
-    base, size = values.data_ptr(), values.element_size()
-
-    def offset(parameter: Any) -> int:
-        return int(parameter.data_ptr() - base) // size
-
-    def norm_at(norms: Any, i: int) -> tuple[int, int]:
-        if i >= len(norms):
-            return -1, -1
-        return (-2, -2) if norms[i].weight is None else (offset(norms[i].weight), offset(norms[i].bias))
-
+def _plan_of(q: Any, flat: FlatParameters) -> Any:
+    """One row per layer; the columns are explained in `neuralq.q.kernels.single`."""
     plan = []
-    stem: Any = q.input.stem
+    stem, trunk = q.input.stem, q.trunk
     if stem is not None:
         channels, height, width = stem.in_shape
-        for i, (weight, bias) in enumerate(zip(stem.weights, stem.biases, strict=True)):
-            c_out, side, stride = weight.shape[0], weight.shape[2], stem.strides[i]
+        for i, (weight, bias, stride) in enumerate(zip(stem.weights, stem.biases, stem.strides, strict=True)):
+            c_out, side = weight.shape[0], weight.shape[2]
             high, wide = (height - side) // stride + 1, (width - side) // stride + 1
             sizes = (channels * height * width, c_out * high * wide)
             geometry = (channels, height, width, c_out, side, stride, high, wide)
-            plan.append((kernels.CONV, *sizes, offset(weight), offset(bias), *norm_at(stem.norms, i), *geometry))
+            plan.append((kernels.CONV, *sizes, *layer_places(flat, weight, bias, stem.norms, i), *geometry))
             channels, height, width = c_out, high, wide
-    trunk: Any = q.trunk
     for i, layer in enumerate(trunk.layers):
-        _, fan_in, fan_out = layer.weight.shape
-        at = (offset(layer.weight), offset(layer.bias), *norm_at(trunk.norms, i))
-        plan.append((kernels.DENSE, fan_in, fan_out, *at, *(0,) * 8))
+        places = layer_places(flat, layer.weight, layer.bias, trunk.norms, i)
+        plan.append((kernels.DENSE, *layer.weight.shape[1:], *places, *(0,) * 8))
     return np.array(plan, np.int64)
