@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import settings
+
+# The tests of a checkout test that checkout, whatever else is installed, and so do the processes that they start.
+ROOT = Path(__file__).resolve().parents[1]
+for name in ("neuralq", "neuralq_envs"):
+    spec = find_spec(name)
+    assert spec is not None and spec.origin is not None and ROOT in Path(spec.origin).resolve().parents, (
+        f"{name} comes from {spec and spec.origin}, not from {ROOT}; run pytest from the root of its own checkout"
+    )
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(ROOT), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 
 # Several test processes share few cores, and single-threaded sums are the same bits on every machine.
 torch.set_num_threads(1)
