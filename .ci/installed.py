@@ -13,7 +13,7 @@ def main(wheel: str) -> None:
     """Raises AssertionError for what does not belong into the wheel, or does not work once it is installed."""
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names if ".dist-info/" not in name}
-    assert tops == {"neuralq", "neuralq_envs", "neuralq_plugin.pth"}, f"unexpected top-level names: {sorted(tops)}"
+    assert tops == {"neuralq", "neuralq_envs"}, f"unexpected top-level names: {sorted(tops)}"
     assert {"neuralq/py.typed", "neuralq_envs/py.typed"} <= set(names), "a py.typed is missing"
     page = {f"neuralq/apps/web/static/{name}" for name in (*STATIC, "play/backgammon.html", "play/tictactoe.html")}
     page.add("neuralq/systems/backgammon/weights.safetensors")
@@ -23,7 +23,7 @@ def main(wheel: str) -> None:
 
     import gymnasium
 
-    environment = gymnasium.make("neuralq/MitchellGrid-v0")  # before any import of neuralq: the point of the check
+    environment = gymnasium.make("neuralq_envs:neuralq/MitchellGrid-v0")  # before any import of neuralq
     observation, _ = environment.reset(seed=0)
     assert environment.observation_space.contains(observation)
 

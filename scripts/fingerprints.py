@@ -16,6 +16,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 
 import neuralq
 
+Case = tuple[str, Callable[[], str]]
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 ENGINES = ("auto", "torch")
 LEARNERS: dict[str, dict[str, Any]] = {
@@ -85,7 +87,7 @@ def short(learner: str, layout: str, engine: str, settings: dict[str, Any]) -> d
     return config
 
 
-def resumed(name: str, config: dict[str, Any], folder: Path) -> str:
+def resumed(config: dict[str, Any], folder: Path) -> str:
     """Half of the run, then the rest of it."""
     neuralq.train(neuralq.with_preset({**config, "total_steps": 300}), folder)
     return neuralq.resume(folder, total_steps=600).parameters_sha256
@@ -121,55 +123,61 @@ def digest(*values: Any) -> str:
     return sha.hexdigest()
 
 
-def exact_cases() -> Iterator[tuple[str, Callable[[], str]]]:
+def exact_cases() -> Iterator[Case]:
     """Exact answers, each method on a Garnet of its own."""
     from neuralq.exact import METHODS, evaluate, evaluate_average, resolvent, solve, solve_average, solve_finite_horizon
 
     model = neuralq.FiniteMDP.garnet(40, 3, 4, seed=5)
     policy = np.full((40, 3), 1 / 3)
+
+    def solved(method: str) -> Any:
+        return solve(model, 0.9, method=method).v
+
     for method in METHODS:
-        yield f"exact {method}", lambda method=method: said_of(lambda: solve(model, 0.9, method=method).v)
+        yield f"exact {method}", partial(said_of, partial(solved, method))
     yield "exact horizon", lambda: digest(solve_finite_horizon(model, 12, 0.9).v)
     yield "exact average", lambda: digest(solve_average(model).gain, evaluate_average(model, policy).gain)
     yield "exact evaluation", lambda: digest(evaluate(model, policy, 0.9))
     yield "exact resolvent", lambda: digest(resolvent(np.full((3, 3), 1 / 3), np.eye(3), 0.9))
 
 
-def lab_cases() -> Iterator[tuple[str, Callable[[], str]]]:
+def lab_cases() -> Iterator[Case]:
     """Verdicts, critical values, remedies and measured runs of the lab."""
     from neuralq import lab
 
-    for name in ("baird", "w2w", "boyan", "garnet"):
-        yield f"lab explain {name}", lambda name=name: digest(lab.diagnose(lab.problem(name), "td").explain())
-    for method in [one.name for one in lab.METHODS]:
-        yield (
-            f"lab diagnose baird {method}",
-            lambda method=method: said_of(lambda: lab.diagnose(star(), method).explain()),
-        )
-        for sampling in ("expected", "markov"):
-            yield (
-                f"lab run baird {method} {sampling}",
-                lambda method=method, sampling=sampling: measured(method, sampling),
-            )
+    def explained(problem: str, method: str) -> str:
+        return lab.diagnose(lab.problem(problem), method).explain()
 
-    yield "lab critical", lambda: digest(lab.critical(star(), "gamma"), lab.critical(star(), "lambda_"))
-    yield "lab remedies", lambda: digest([one.explain() for one in lab.prescribe(star())])
-
-
-def star() -> Any:
-    from neuralq import lab
-
-    return lab.problem("baird")
-
-
-def measured(method: str, sampling: str) -> str:
-    from neuralq import lab
-
-    def result() -> Any:
-        run = lab.run(star(), method, 200, 0.005, sampling=sampling, num_seeds=3, seed=2)
+    def measured(method: str, sampling: Any) -> Any:
+        run = lab.run(lab.problem("baird"), method, 200, 0.005, sampling=sampling, num_seeds=3, seed=2)
         return run.rmsve, run.weights
 
-    return said_of(result)
+    for name in ("baird", "w2w", "boyan", "garnet"):
+        yield f"lab explain {name}", partial(said_of, partial(explained, name, "td"))
+    for method in [one.name for one in lab.METHODS]:
+        yield f"lab diagnose baird {method}", partial(said_of, partial(explained, "baird", method))
+        for sampling in ("expected", "markov"):
+            yield f"lab run baird {method} {sampling}", partial(said_of, partial(measured, method, sampling))
+    star = lab.problem("baird")
+    yield "lab critical", lambda: digest(lab.critical(star, "gamma"), lab.critical(star, "lambda_"))
+    yield "lab remedies", lambda: digest([one.explain() for one in lab.prescribe(star)])
+
+
+def tabular_cases() -> Iterator[Case]:
+    """Every kind of tabular learner on one model."""
+    from neuralq import tabular
+
+    model = neuralq.FiniteMDP.garnet(30, 3, 3, seed=7)
+
+    def learned(name: str) -> Any:
+        discount = {} if name == "r_learning" else {"gamma": 0.9}
+        return getattr(tabular, name)(model, 2000, **discount, seed=1).q
+
+    for name in (
+        "q_learning", "sarsa", "expected_sarsa", "double_q", "q_lambda", "sarsa_lambda", "n_step", "dyna_q",
+        "prioritized_sweeping", "queue_dyna", "episodic_q_learning", "r_learning",
+    ):  # fmt: skip
+        yield f"tabular {name}", partial(said_of, partial(learned, name))
 
 
 def outcome(compute: Callable[[], str]) -> str:
@@ -185,21 +193,16 @@ def said_of(compute: Callable[[], Any]) -> str:
     return outcome(lambda: digest(compute()))
 
 
-def tabular_cases() -> Iterator[tuple[str, Callable[[], str]]]:
-    """Every kind of tabular learner on one model."""
-    from neuralq import tabular
-
-    model = neuralq.FiniteMDP.garnet(30, 3, 3, seed=7)
-    for name in (
-        "q_learning", "sarsa", "expected_sarsa", "double_q", "q_lambda", "sarsa_lambda", "n_step", "dyna_q",
-        "prioritized_sweeping", "queue_dyna", "episodic_q_learning", "r_learning",
-    ):  # fmt: skip
-        yield f"tabular {name}", lambda name=name: digest(tabular_values(getattr(tabular, name), model))
-
-
-def tabular_values(learn: Callable[..., Any], model: Any) -> Any:
-    learned = learn(model, 2000, seed=1) if learn.__name__ == "r_learning" else learn(model, 2000, 0.9, seed=1)
-    return learned.q
+def cases(folder: Path) -> Iterator[Case]:
+    for name, config in run_cases():
+        yield f"run {name}", partial(outcome, partial(trained, config, folder / name))
+        if name.endswith("action-output auto"):
+            yield f"resumed {name}", partial(resumed, config, folder / f"resumed {name}")
+    for mode in ("online", "batched"):
+        yield f"td-gammon {mode}", partial(backgammon, mode)
+    yield from exact_cases()
+    yield from tabular_cases()
+    yield from lab_cases()
 
 
 def main() -> int:
@@ -210,20 +213,7 @@ def main() -> int:
     options = parser.parse_args()
     found: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
-        runs: list[tuple[str, Callable[[], str]]] = [
-            *(
-                (f"run {name}", lambda name=name, config=config: outcome(lambda: trained(config, Path(folder) / name)))
-                for name, config in run_cases()
-            ),
-            *(
-                (f"resumed {name}", lambda name=name, config=config: resumed(name, config, Path(folder) / f"r {name}"))
-                for name, config in run_cases()
-                if name.endswith("action-output auto")
-            ),
-            *((f"td-gammon {mode}", lambda mode=mode: backgammon(mode)) for mode in ("online", "batched")),
-            *exact_cases(), *tabular_cases(), *lab_cases(),
-        ]  # fmt: skip
-        for name, compute in runs:
+        for name, compute in cases(Path(folder)):
             if options.only in name:
                 found[name] = compute()
                 print(f"{found[name][:16]}  {name}", flush=True)

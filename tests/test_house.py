@@ -11,10 +11,14 @@ import importlib
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from neuralq import RunConfig
+from neuralq.runs.recipe.build import make_envs
 
 ROOT = Path(__file__).parents[1]
 LIBRARY = sorted([*(ROOT / "neuralq").rglob("*.py"), *(ROOT / "envs").rglob("*.py")])
@@ -204,7 +208,7 @@ ROOMS = {"apps", "lab", "systems", "runs", "learners", "q", "tabular", "exact", 
 def test_the_top_of_the_package_shows_the_rooms_and_little_else() -> None:
     top = {path for path in (ROOT / "neuralq").iterdir() if path.name != "__pycache__"}
     assert {path.name for path in top if path.is_file()} <= LOOSE_FILES
-    assert {path.name for path in top if path.is_dir()} == ROOMS
+    assert {path.name for path in top if any(path.rglob("*.py"))} == ROOMS
 
 
 def test_every_folder_with_code_is_a_package() -> None:
@@ -269,18 +273,41 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
         _ = neuralq.FiniteMdp  # type: ignore[attr-defined]
 
 
-def test_environments_are_found_without_an_import_of_neuralq() -> None:
-    # As at the start of the interpreter, where neuralq_plugin.pth makes the same call.
-    program = (
-        "import sys; sys.path[:0] = ['envs', '.']; import neuralq.plugin; neuralq.plugin.install(); "
-        "neuralq.plugin.install(); assert 'gymnasium' not in sys.modules\n"
-        "import importlib.util; assert importlib.util.find_spec('gymnasium')  # asking is not importing\n"
-        "import gymnasium; gymnasium.make('neuralq/MitchellGrid-v0').reset(seed=0)\n"
-        "neuralq.plugin.install(); assert not any('AfterGym' in type(f).__name__ for f in sys.meta_path)\n"
+def in_a_fresh_process(program: str) -> str:
+    run = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False)
+    assert run.returncode == 0 and not run.stderr, run.stderr
+    return run.stdout
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import gymnasium; gymnasium.make('neuralq_envs:neuralq/MitchellGrid-v0').reset(seed=0)",
+        "import neuralq_envs, gymnasium; neuralq_envs.register(); gymnasium.make('neuralq/MitchellGrid-v0').reset()",
+        "import gymnasium, neuralq_envs; gymnasium.make_vec('neuralq/MitchellGrid-v0', num_envs=2).reset(seed=0)",
+        "import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0",
+        "from neuralq.runs.recipe.build import make_envs; import neuralq; "
+        "make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()",
+    ],
+)
+def test_environments_are_found_by_an_import_and_by_what_neuralq_does(program: str) -> None:
+    in_a_fresh_process(program)
+
+
+def test_nothing_runs_at_the_start_of_an_interpreter() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert not [*(ROOT / "neuralq").rglob("*.pth"), *(ROOT / "envs").rglob("*.pth")]
+    assert "force-include" not in str(project["tool"]["hatch"]) and "entry-points" not in project["project"]
+
+
+def test_an_unknown_environment_of_ours_is_answered_with_the_known_ones_and_the_line_that_works() -> None:
+    with pytest.raises(ValueError, match="Did you mean: `MitchellGrid`") as refused:
+        make_envs(RunConfig(env="neuralq/MitchelGrid-v0"), 1)
+    line = re.search(r"'(neuralq_envs:[\w/-]+)'", str(refused.value))
+    assert line is not None and "\n" not in str(refused.value)
+    assert (
+        in_a_fresh_process(f"import gymnasium; print(gymnasium.make({line[1]!r}).observation_space)") == "Discrete(6)\n"
     )
-    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    assert not run.stderr, "registering twice would warn"
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)

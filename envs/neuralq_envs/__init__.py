@@ -1,18 +1,18 @@
 """Environments with a known answer: each gives its exact `FiniteMDP` beside the Gymnasium interface.
 
 Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`), and games too large for an exact model
-(`GAMES`). `register` is the package's ``gymnasium.envs`` entry point, so ``gymnasium.make("neuralq/MitchellGrid-v0")``
-finds them.
+(`GAMES`). Importing this package registers them all, and Gymnasium imports it by itself where an id names it:
+``gymnasium.make("neuralq_envs:neuralq/MitchellGrid-v0")``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs import registration
+from gymnasium.envs.registration import EnvSpec
 
 __all__ = ["CLASSIC", "ENVIRONMENTS", "GAMES", "Classic", "Registration", "register", "vector_twin"]
 
@@ -102,7 +102,6 @@ def vector_twin(spec: EnvSpec, given: Mapping[str, Any]) -> tuple[str, dict[str,
 
     Example:
         >>> import gymnasium
-        >>> register()
         >>> vector_twin(gymnasium.spec("Acrobot-v1"), {})
         ('neuralq/Acrobot-v0', {'max_episode_steps': 500})
         >>> vector_twin(gymnasium.spec("Acrobot-v1"), {"render_mode": "human"}) is None
@@ -126,9 +125,6 @@ def register() -> None:
         >>> gymnasium.make("neuralq/MitchellGrid-v0").observation_space
         Discrete(6)
     """
-    # Imported here: importing Gymnasium calls this function, which must be there by then.
-    from gymnasium.envs import registration
-
     for env_id, one in (ENVIRONMENTS | GAMES).items():
         if env_id not in registration.registry:
             registration.register(
@@ -146,3 +142,6 @@ def register() -> None:
                 max_episode_steps=classic.max_episode_steps,
                 reward_threshold=classic.reward_threshold,
             )
+
+
+register()

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from neuralq.apps.pages.text import ARROWS, drawing_lines
 from neuralq.exact import METHODS, Solution, count_optimal_policies
 from neuralq.exact import solve as solve_mdp
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.recipe.games import make_single, refusals_name
 
 __all__ = ["solve"]
 
@@ -104,10 +104,8 @@ def _json_object(text: str) -> dict[str, Any]:
 
 
 def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | None]:
-    try:
-        env = gym.make(env_id, **kwargs)
-    except Exception as error:  # the environment's own code ran
-        raise ValueError(f"cannot make the environment {env_id!r}: {type(error).__name__}: {error}") from error
+    with refusals_name(env_id):
+        env = make_single(env_id, kwargs)
     try:
         mdp = FiniteMDP.from_gymnasium(env)
         return mdp, _layout(env.unwrapped, mdp)

@@ -17,7 +17,7 @@ from neuralq.checks import MissingExtra
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.loop import seed_for
-from neuralq.runs.recipe.games import make_single
+from neuralq.runs.recipe.games import make_single, refusals_name
 from neuralq.runs.stream import legal_actions
 
 if TYPE_CHECKING:
@@ -55,12 +55,12 @@ def make_shown(config: RunConfig, mode: str) -> gym.Env[Any, Any]:
         MissingExtra: if what it draws with is not installed.
         ValueError: if it cannot be made.
     """
-    try:
-        return make_single(config.env, config.env_kwargs, mode)
-    except gym.error.DependencyNotInstalled as error:
-        raise MissingExtra(f"{config.env} cannot be drawn ({error}); {_INSTALL}") from error
-    except Exception as error:  # the environment's own code ran
-        raise ValueError(f"cannot make the environment {config.env!r}: {type(error).__name__}: {error}") from error
+    with refusals_name(config.env):
+        try:
+            return make_single(config.env, config.env_kwargs, mode)
+        except gym.error.DependencyNotInstalled as error:
+            missing = error
+    raise MissingExtra(f"{config.env} cannot be drawn ({missing}); {_INSTALL}") from missing
 
 
 def play(env: gym.Env[Any, Any], agent: Agent, num_episodes: int, seed: int, max_steps: int) -> Iterator[Moment]:

@@ -25,7 +25,7 @@ from neuralq.rules import Linear
 from neuralq.runs.folder.env_probe import is_resumable
 from neuralq.runs.loop import Plan, Session, seed_for
 from neuralq.runs.recipe.config import RunConfig
-from neuralq.runs.recipe.games import ATARI, make_single, register_games
+from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
@@ -58,7 +58,7 @@ def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> Vecto
     """
     module, _, env_id = config.env.rpartition(":")
     register_games(env_id)
-    try:
+    with refusals_name(config.env):
         if module:  # registers the environment
             importlib.import_module(module)
         spec = gym.spec(env_id)
@@ -69,13 +69,6 @@ def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> Vecto
             return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
         clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
         return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
-    except gym.error.Error as error:
-        raise ValueError(
-            f"cannot make the environment {config.env!r}: {str(error).rstrip('.')}. Name a registered Gymnasium id; an "
-            "environment of your own is found as 'your_module:YourEnv-v0'"
-        ) from error
-    except Exception as error:  # the environment's own code ran
-        raise ValueError(f"cannot make the environment {config.env!r}: {type(error).__name__}: {error}") from error
 
 
 def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:

@@ -6,20 +6,24 @@ not played from as it is: 84 × 84 grey frames, the brighter of the last two of 
 stacked, and up to 30 idle steps at the start (Mnih et al. 2015), by Gymnasium's own wrappers. Rewards are those of the
 game, and a lost life does not end the episode, unless a run asks for that in training; it is evaluated without. The
 emulator's vectorised implementation is left alone: it takes as much CPU time per step as these do (measured), and hands
-out clipped rewards.
+out clipped rewards. The ids of neuralq's own environments are known wherever this module is: importing them registers
+them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
-__all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "register_games"]
+import neuralq_envs
+
+__all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "refusals_name", "register_games"]
 
 MINATAR, ATARI = "MinAtar/", "ALE/"
 _NUM_NOOPS, _FRAME_SKIP, _SIDE, _NUM_STACKED = 30, 4, 84, 4
@@ -55,6 +59,32 @@ def register_games(env_id: str) -> None:
 
 def _missing(env_id: str, extra: str, error: ImportError) -> ValueError:
     return ValueError(f"{env_id} needs the extra {extra!r} ({error}): pip install 'neuralq[{extra}]'")
+
+
+@contextlib.contextmanager
+def refusals_name(env: str) -> Iterator[None]:
+    """Whatever goes wrong while ``env`` is made becomes one line that names it and what to do about it.
+
+    Raises:
+        ValueError: the environment is not registered, or its own code failed.
+
+    Example:
+        >>> with refusals_name("neuralq/MitchelGrid-v0"):
+        ...     gym.make("neuralq/MitchelGrid-v0")
+        Traceback (most recent call last):
+        ...
+        ValueError: cannot make the environment 'neuralq/MitchelGrid-v0': ... Did you mean: `MitchellGrid`? ...
+    """
+    try:
+        yield
+    except gym.error.Error as error:
+        way_out = "Name a registered Gymnasium id; an environment of your own is found as 'your_module:YourEnv-v0'"
+        if env.startswith("neuralq/"):
+            known = ", ".join(id.removeprefix("neuralq/") for id in neuralq_envs.ENVIRONMENTS)
+            way_out = f"neuralq has {known}; elsewhere they are found as 'neuralq_envs:neuralq/MitchellGrid-v0'"
+        raise ValueError(f"cannot make the environment {env!r}: {str(error).rstrip('.')}. {way_out}") from error
+    except Exception as error:  # the environment's own code ran
+        raise ValueError(f"cannot make the environment {env!r}: {type(error).__name__}: {error}") from error
 
 
 def make_single(
