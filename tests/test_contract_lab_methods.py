@@ -54,9 +54,9 @@ import pytest
 from numpy.typing import NDArray
 
 from neuralq.lab import Method, Problem, method
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.sampling import Sample
 from neuralq.lab.methods import METHODS, Expected, Learner
-from neuralq.lab.process import Process, linear_process
-from neuralq.lab.sampling import Sample
 from neuralq.mdp import FiniteMDP
 
 Floats = NDArray[np.float64]
