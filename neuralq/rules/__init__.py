@@ -10,6 +10,8 @@ from __future__ import annotations
 from neuralq.rules.distributional import (
     categorical_cross_entropy,
     categorical_projection,
+    followed_mass,
+    followed_values,
     quantile_huber,
     quantile_levels,
 )
@@ -27,6 +29,7 @@ from neuralq.rules.returns import (
     watkins_lambda,
 )
 from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
+from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule, target_rules
 from neuralq.rules.targets import (
     double_q,
     expected_sarsa,
@@ -41,9 +44,13 @@ from neuralq.rules.traces import accumulate, cut, dutch, replace, true_online_in
 __all__ = [
     "Constant",
     "Exponential",
+    "Followed",
     "Linear",
+    "Option",
     "Power",
     "Schedule",
+    "Seen",
+    "TargetRule",
     "accumulate",
     "categorical_cross_entropy",
     "categorical_projection",
@@ -53,6 +60,8 @@ __all__ = [
     "epsilon_greedy",
     "expected_sarsa",
     "expected_value",
+    "followed_mass",
+    "followed_values",
     "forward_episode_update",
     "greedy",
     "greedy_random_ties",
@@ -78,6 +87,7 @@ __all__ = [
     "soft_value",
     "softmax",
     "squared",
+    "target_rules",
     "tree_backup_coefficients",
     "true_online_increment",
     "watkins_lambda",

@@ -10,7 +10,8 @@ after a step each represented value z becomes ``r_t + discount_t · z``. Two fin
   of the grid and are shared between the two neighbours in inverse proportion to the distance
   (`categorical_projection`). Inside the range of the grid that keeps the mean exactly; outside it values are clipped.
 
-Which action is followed is decided by the means, as in Q-learning; nothing in this file chooses.
+What is followed in the successor is decided by the means, as in Q-learning; nothing in this file chooses. A policy that
+draws its action has the mixture of the actions' distributions for its return.
 """
 
 from __future__ import annotations
@@ -21,8 +22,17 @@ from torch import Tensor
 from neuralq.checks import check_positive, check_whole
 from neuralq.rules.losses import huber
 from neuralq.rules.shapes import check_same_shape
+from neuralq.rules.target_rule import Followed
+from neuralq.rules.targets import one_step, weighted_value
 
-__all__ = ["categorical_cross_entropy", "categorical_projection", "quantile_huber", "quantile_levels"]
+__all__ = [
+    "categorical_cross_entropy",
+    "categorical_projection",
+    "followed_mass",
+    "followed_values",
+    "quantile_huber",
+    "quantile_levels",
+]
 
 
 def quantile_levels(num_quantiles: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -51,15 +61,23 @@ def quantile_levels(num_quantiles: int, dtype: torch.dtype = torch.float64) -> T
     return (torch.arange(num_quantiles, dtype=dtype) + 0.5) / num_quantiles
 
 
-def quantile_huber(quantiles_tm1: Tensor, target: Tensor, delta: float = 1.0) -> Tensor:
+def quantile_huber(
+    quantiles_tm1: Tensor,
+    target: Tensor,
+    delta: float = 1.0,
+    levels: Tensor | None = None,
+    probabilities: Tensor | None = None,
+) -> Tensor:
     """Quantile regression: an error is punished by τ if the value was too low and by 1 − τ if it was too high.
 
     ``Σ_i mean_j |τ_i − 1{u_ij < 0}| · huber(u_ij)`` with ``u_ij = target[j] − quantiles_tm1[i]``.
 
     Args:
         quantiles_tm1: the values of one pair, ``[*n, K]``.
-        target: equally likely values they should describe, ``[*n, J]``.
+        target: the values they should describe, ``[*n, J]``.
         delta: where Huber's parabola becomes a line, above 0; the smaller, the nearer to exact quantiles.
+        levels: τ of each value, ``[*n, K]``; None for `quantile_levels`.
+        probabilities: of the target's values, ``[*n, J]``; None where they are equally likely.
 
     Returns:
         ``[*n]``.
@@ -67,7 +85,7 @@ def quantile_huber(quantiles_tm1: Tensor, target: Tensor, delta: float = 1.0) ->
     Raises:
         ValueError: if the leading axes differ or ``delta`` is not a finite number above 0.
 
-    Source: Dabney et al. 2018, eq. 10 (their κ is ``delta``).
+    Source: Dabney et al. 2018, eq. 10 (their κ is ``delta``); with other levels Dabney, Ostrovski, Silver & Munos 2018.
 
     Example:
         Both errors are +1 and −1: ¾·½ + ¼·½, for the one quantile at level ½ they weigh the same.
@@ -80,9 +98,97 @@ def quantile_huber(quantiles_tm1: Tensor, target: Tensor, delta: float = 1.0) ->
     check_positive("delta", delta)
     check_same_shape("each column of target", target[..., 0], "each column of quantiles_tm1", quantiles_tm1[..., 0])
     error = target[..., None, :] - quantiles_tm1[..., :, None]
-    levels = quantile_levels(quantiles_tm1.shape[-1], quantiles_tm1.dtype).to(error.device)[:, None]
-    slope = torch.where(error < 0, 1.0 - levels, levels)
-    return (slope * huber(error, delta)).mean(-1).sum(-1)
+    if levels is None:
+        tau = quantile_levels(quantiles_tm1.shape[-1], quantiles_tm1.dtype).to(error.device)[:, None]
+    else:
+        check_same_shape("levels", levels, "quantiles_tm1", quantiles_tm1)
+        tau = levels[..., None]
+    each = torch.where(error < 0, 1.0 - tau, tau) * huber(error, delta)
+    if probabilities is None:
+        return each.mean(-1).sum(-1)
+    check_same_shape("probabilities", probabilities, "target", target)
+    return (each * probabilities[..., None, :]).sum(-1).sum(-1)
+
+
+def followed_values(
+    r_t: Tensor, discount_t: Tensor, values_t: Tensor, followed: Followed
+) -> tuple[Tensor, Tensor | None]:
+    """The values of what is followed, each moved by the step: ``r_t + discount_t · z``, and how likely they are.
+
+    Args:
+        r_t: reward, ``[*n]``.
+        discount_t: γ, or 0 at termination, ``[*n]``.
+        values_t: equally likely values of every action of the successor, ``[*n, A, K]``.
+        followed: what is done there, and what is added.
+
+    Returns:
+        Values and their probabilities: ``[*n, K]`` and None for equally likely ones, or where a policy draws its action
+        ``[*n, A·K]`` twice. Where no action is legal the first stands in, for nothing comes after.
+
+    Source: Dabney et al. 2018, eq. 13; mixtures: Bellemare, Dabney & Rowland 2023, chapter 4.
+
+    Example:
+        >>> pi = torch.tensor([0.25, 0.75])
+        >>> followed_values(torch.tensor(1.0), torch.tensor(0.5), torch.tensor([[2.0], [4.0]]), Followed(pi=pi))
+        (tensor([2., 3.]), tensor([0.2500, 0.7500]))
+    """
+    num_atoms, probabilities = values_t.shape[-1], None
+    if followed.a is not None:
+        z = _of_action(values_t, followed.a)
+    elif followed.averaged:
+        z = (_policy(followed)[..., None] * values_t).sum(-2)
+    else:
+        z = values_t.flatten(-2)
+        probabilities = (_or_first(_policy(followed)) / num_atoms).repeat_interleave(num_atoms, -1)
+    if followed.entropy is not None:
+        z = z + followed.entropy[..., None]
+    r_t = r_t if followed.bonus is None else r_t + followed.bonus
+    return one_step(r_t[..., None].expand_as(z), discount_t[..., None].expand_as(z), z), probabilities
+
+
+def followed_mass(r_t: Tensor, discount_t: Tensor, logits_t: Tensor, support: Tensor, followed: Followed) -> Tensor:
+    """The mass of what is followed, moved by the step and projected on the grid it came from.
+
+    Args:
+        r_t: reward, ``[*n]``.
+        discount_t: γ, or 0 at termination, ``[*n]``.
+        logits_t: of every action of the successor, ``[*n, A, K]``.
+        support: the grid, ``[K]``.
+        followed: what is done there, and what is added. A policy mixes the actions' mass.
+
+    Returns:
+        Probabilities, ``[*n, K]``.
+
+    Source: Bellemare, Dabney & Munos 2017, algorithm 1.
+
+    Example:
+        >>> logits, grid = torch.zeros(1, 3), torch.tensor([0.0, 1.0, 2.0])
+        >>> followed_mass(torch.tensor(1.0), torch.tensor(0.0), logits, grid, Followed(a=torch.tensor(0)))
+        tensor([0., 1., 0.])
+    """
+    if followed.a is not None:
+        mass = torch.softmax(_of_action(logits_t, followed.a), -1)
+    else:
+        mass = (_or_first(_policy(followed))[..., None] * torch.softmax(logits_t, -1)).sum(-2)
+    r_t = r_t if followed.bonus is None else r_t + followed.bonus
+    z = support if followed.entropy is None else support + followed.entropy[..., None]
+    return categorical_projection(r_t[..., None] + weighted_value(discount_t[..., None], z), mass, support)
+
+
+def _of_action(numbers: Tensor, a: Tensor) -> Tensor:
+    """The K numbers of the given actions: ``([*n, A, K], [*n]) -> [*n, K]``."""
+    return numbers.gather(-2, a[..., None, None].expand(*a.shape, 1, numbers.shape[-1]))[..., 0, :]
+
+
+def _policy(followed: Followed) -> Tensor:
+    assert followed.pi is not None
+    return followed.pi
+
+
+def _or_first(pi: Tensor) -> Tensor:
+    """``pi``, with all of it on the first action where none is legal."""
+    none = (pi.sum(-1, keepdim=True) == 0).to(pi.dtype)
+    return pi + torch.nn.functional.pad(none, (0, pi.shape[-1] - 1))
 
 
 def categorical_projection(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:

@@ -16,10 +16,13 @@ import torch
 from torch import Tensor
 
 from neuralq.checks import check_fraction, check_positive
+from neuralq.rules.one_step import TEMPERATURE
+from neuralq.rules.policies import softmax
 from neuralq.rules.shapes import check_actions, check_same_shape
-from neuralq.rules.targets import one_step
+from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule
+from neuralq.rules.targets import expected_value, one_step
 
-__all__ = ["munchausen", "munchausen_bonus", "soft_value"]
+__all__ = ["MUNCHAUSEN", "munchausen", "munchausen_bonus", "soft_value"]
 
 
 def soft_value(q: Tensor, temperature: float) -> Tensor:
@@ -70,8 +73,7 @@ def munchausen_bonus(q_tm1: Tensor, a_tm1: Tensor, temperature: float, alpha: fl
     check_positive("temperature", temperature)
     check_fraction("alpha", alpha)
     check_actions("a_tm1", a_tm1, "q_tm1", q_tm1)
-    if not floor < 0:
-        raise ValueError(f"floor must be below 0, the largest logarithm of a probability, got {floor!r}; -1 is usual")
+    _check_floor("floor", floor)
     # q − max first, then the logarithm: q / τ alone would lose the differences in float32.
     chosen = q_tm1.gather(-1, a_tm1[..., None])[..., 0]
     log_policy = chosen - _best(q_tm1) - temperature * _log_mass(q_tm1, temperature)
@@ -128,3 +130,52 @@ def _log_mass(q: Tensor, temperature: float) -> Tensor:
     best = _best(q)[..., None]
     gap = (q - best.masked_fill(torch.isneginf(best), 0.0)) / temperature
     return torch.logsumexp(gap, -1).clamp(min=0.0)
+
+
+def _check_floor(name: str, value: float) -> None:
+    if not value < 0:
+        raise ValueError(f"{name} must be below 0, the largest logarithm of a probability, got {value!r}; -1 is usual")
+
+
+def _numbers(seen: Seen) -> tuple[float, float, float]:
+    """τ, α and the floor of τ log π."""
+    return seen.options["temperature"], seen.options["munchausen_alpha"], seen.options["munchausen_floor"]
+
+
+def _follows(seen: Seen) -> Followed:
+    """The softmax policy, with its entropy on top, and the bonus; quantiles are averaged, as published."""
+    temperature, alpha, floor = _numbers(seen)
+    pi = softmax(seen.q_t, temperature)
+    entropy = soft_value(seen.q_t, temperature) - expected_value(seen.q_t, pi)
+    bonus = munchausen_bonus(seen.q_tm1, seen.transition.a_tm1, temperature, alpha, floor)
+    return Followed(pi=pi, bonus=bonus, entropy=entropy, averaged=True)
+
+
+MUNCHAUSEN = TargetRule(
+    name="munchausen",
+    title="Munchausen Q-learning: soft values and a bonus for being sure",
+    source="Vieillard, Pietquin & Geist 2020",
+    follows=_follows,
+    mean=lambda seen: munchausen(
+        seen.r_t, seen.discount_t, seen.q_tm1, seen.transition.a_tm1, seen.q_t, *_numbers(seen)
+    ),
+    options={
+        "temperature": TEMPERATURE,
+        "munchausen_alpha": Option(
+            0.9, check_fraction, "α, how much of τ log π is added to the reward", "has no Munchausen bonus"
+        ),
+        "munchausen_floor": Option(
+            -1.0,
+            _check_floor,
+            "the smallest τ log π that counts, in units of scaled rewards",
+            "has no Munchausen bonus",
+        ),
+    },
+    refuses={
+        "num_steps": "munchausen adds a bonus to every reward and an n-step sample holds only their sum, got num_steps="
+        "{num_steps}; leave num_steps=1",
+        "bounded": "munchausen's soft values lie up to temperature · log A above every return, outside the grid of a "
+        "{distribution} distribution; use distribution='quantile'",
+    },
+    place=4,
+)

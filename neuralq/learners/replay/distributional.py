@@ -1,9 +1,9 @@
 """Distributional Q-learning from replay: the target is where a transition moves the whole distribution.
 
-From the target copy, the action with the best *mean* in the successor is followed (with "double" it is chosen by the
-online network, with "munchausen" the softmax policy mixes all of them), and every represented value z of it becomes
-r + γ z. `QuantileQ` regresses its values on these (QR-DQN, Dabney et al. 2018), `CategoricalQ` takes their projection
-on its grid for labels (C51, Bellemare, Dabney & Munos 2017).
+What the target rule follows in the successor is decided by the *means*, and every represented value z of it, by the
+target copy, becomes r + γ z. What is made of these is said in `neuralq.learners.replay.distributions`: `QuantileQ`
+regresses its values on them (QR-DQN, Dabney et al. 2018), `CategoricalQ` takes their projection on its grid for labels
+(C51, Bellemare, Dabney & Munos 2017).
 
 What is reported as an error is the difference of the means; priorities are made of it as well.
 """
@@ -13,16 +13,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq import rules
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.distributions.record import Description, Moved, distributions
 from neuralq.learners.replay.settings import ReplaySettings
-from neuralq.q.distributional import CategoricalQ, atoms, distribution_of
+from neuralq.q.distributional import distribution_of
 from neuralq.q.engine import Engine, TorchEngine
 from neuralq.q.masked import MaskedQ
+from neuralq.rules import Seen
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import QFunction, Transition
 
@@ -30,12 +32,13 @@ __all__ = ["DistributionalLearner"]
 
 
 class DistributionalLearner:
-    """QR-DQN or C51 on samples ``[B]`` with a target network.
+    """Distributional Q-learning on samples ``[B]`` with a target network.
 
     Args:
-        engine: of a `QuantileQ` or a `CategoricalQ`, masked or not.
+        engine: of the Q-function that describes distributions so (`QuantileQ`, `CategoricalQ`), masked or not.
         settings: how to learn; ``distribution`` must name that representation.
         reward_scale: rewards are multiplied by it, so values are too (and a categorical grid must be).
+        rng: draws the levels of an update where the description has them drawn.
 
     Raises:
         ValueError: if representation and settings do not go together.
@@ -52,61 +55,60 @@ class DistributionalLearner:
         [[0.0, 0.5, 0.5]]
     """
 
-    def __init__(self, engine: TorchEngine, settings: ReplaySettings, reward_scale: float = 1.0) -> None:
-        kind = "categorical" if isinstance(distribution_of(engine.q), CategoricalQ) else "quantile"
-        if settings.distribution != kind or settings.num_atoms != distribution_of(engine.q).num_atoms:
-            raise ValueError(
-                f"settings with distribution={settings.distribution!r} and num_atoms={settings.num_atoms} do not go "
-                f"with a {kind} representation of {distribution_of(engine.q).num_atoms} atoms; make them alike"
-            )
+    def __init__(
+        self,
+        engine: TorchEngine,
+        settings: ReplaySettings,
+        reward_scale: float = 1.0,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self._described = _description_for(engine.q, settings)
         self.engine: Engine = engine
         self._networks = engine
         self.settings = settings
         self.reward_scale = reward_scale
+        self.rng = np.random.default_rng(0) if rng is None else rng
         self.num_updates = 0
+        self._options = settings.options
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
         engine.sync_target()
 
-    @torch.no_grad()
     def targets(self, transition: Transition) -> Tensor:
-        """What the pair's K numbers should describe, ``[B, K]``: equally likely values, or probabilities."""
-        target = self._networks.network(target=True)
-        q_t, outputs_t = target.all(transition.s_t), atoms(target, transition.s_t)
-        r_t = transition.r_t.to(q_t.dtype) * self.reward_scale
-        discount_t = transition.discount_t.to(q_t.dtype)[:, None]
-        if self.settings.target_rule == "munchausen":
-            temperature, alpha, floor = self.settings.munchausen_numbers
-            q_tm1 = target.all(transition.s_tm1)
-            r_t = r_t + rules.munchausen_bonus(q_tm1, transition.a_tm1, temperature, alpha, floor)
-            soft = _soft(q_t, outputs_t, temperature)
-            return rules.one_step(r_t[:, None].expand_as(soft), discount_t.expand_as(soft), soft)
-        chooser = self.engine.q.all(transition.s_t) if self.settings.target_rule == "double" else q_t
-        followed = _at(outputs_t, chooser.argmax(-1))
-        distribution = distribution_of(target)
-        if isinstance(distribution, CategoricalQ):
-            moved = r_t[:, None] + discount_t * distribution.support
-            return rules.categorical_projection(moved, torch.softmax(followed, -1), distribution.support)
-        return r_t[:, None] + discount_t * followed
+        """What the pair's numbers should describe: values ``[B, J]``, or probabilities ``[B, K]`` on a grid."""
+        moved = self._moved(transition)
+        return moved.values if moved.probabilities is None or moved.values.dim() > 1 else moved.probabilities
+
+    @torch.no_grad()
+    def _moved(self, transition: Transition) -> Moved:
+        target, described = self._networks.network(target=True), self._described
+        seen = Seen(transition, self.engine.all, self.reward_scale, self.settings.lambda_, self._options)
+        outputs_t = described.outputs(target, transition.s_t, self._levels(len(transition.a_tm1)))
+        assert self.settings.rule.follows is not None
+        followed = self.settings.rule.follows(seen)
+        return described.move(distribution_of(target), seen.r_t, seen.discount_t, outputs_t, followed)
+
+    def _levels(self, num_rows: int) -> Tensor | None:
+        """Levels ``[B, K]`` drawn for one side of an update, where they are drawn."""
+        if self._described.levels is None or self.settings.num_atoms is None:
+            return None
+        return self._described.levels(num_rows, self.settings.num_atoms, self.rng).to(self.engine.flat.values)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One descent step on a batch; ``weight`` ``[B]`` multiplies each sample's loss."""
         s, a = transition.s_tm1, transition.a_tm1
         check_same_shape("a_tm1", a, "r_t", transition.r_t)
-        _check_legal(self.engine.q, s, a, weight)
-        targets = self.targets(transition)
+        if isinstance(self.engine.q, MaskedQ):
+            self.engine.q.check_legal(s, a, weight)
+        moved, levels = self._moved(transition), self._levels(len(a))
         self.engine.flat.grad.zero_()
-        outputs = _at(atoms(self.engine.q, s), a)
-        distribution = distribution_of(self.engine.q)
-        if isinstance(distribution, CategoricalQ):
-            each = rules.categorical_cross_entropy(outputs, targets)
-            aim = (targets * distribution.support).sum(-1)
-        else:
-            each, aim = rules.quantile_huber(outputs, targets), targets.mean(-1)
+        outputs = self._described.outputs(self.engine.q, s, levels)
+        outputs = outputs.gather(1, a[:, None, None].expand(-1, 1, outputs.shape[-1]))[:, 0]
+        each, aim = self._described.loss(outputs, moved, levels), moved.mean()
         if weight is not None:
             check_same_shape("weight", weight, "r_t", transition.r_t)
             each = each * weight.to(each)
         each.mean().backward()  # type: ignore[no-untyped-call]
-        errors = aim - distribution.mean(outputs.detach())
+        errors = aim - distribution_of(self.engine.q).mean(outputs.detach())
         self._descent.follow()
         self.num_updates += 1
         if self.num_updates % (self.settings.target_period_updates or 1) == 0:
@@ -126,18 +128,13 @@ class DistributionalLearner:
         self._descent.load_state_dict(state["descent"])
 
 
-def _at(outputs: Tensor, a: Tensor) -> Tensor:
-    """The K numbers of the given actions: ``([B, A, K], [B]) -> [B, K]``."""
-    return outputs.gather(1, a[:, None, None].expand(-1, 1, outputs.shape[-1]))[:, 0]
-
-
-def _soft(q: Tensor, outputs: Tensor, temperature: float) -> Tensor:
-    """Values whose mean is the soft value of the state: the policy's mixture of each, and its entropy."""
-    pi = rules.softmax(q, temperature)
-    entropy = rules.soft_value(q, temperature) - rules.expected_value(q, pi)
-    return (pi[..., None] * outputs).sum(-2) + entropy[..., None]
-
-
-def _check_legal(q: QFunction, s: Tensor, a: Tensor, weight: Tensor | None) -> None:
-    if isinstance(q, MaskedQ):
-        q.check_legal(s, a, weight)
+def _description_for(q: QFunction, settings: ReplaySettings) -> Description:
+    """The description that the settings name, if it is that of ``q``."""
+    learned, inner = settings.returns.description, distribution_of(q)
+    if learned is None or not isinstance(inner, learned.q_class) or settings.num_atoms != inner.num_atoms:
+        known = [x.name for x in distributions().values() if x.description and isinstance(inner, x.description.q_class)]
+        raise ValueError(
+            f"settings with distribution={settings.distribution!r} and num_atoms={settings.num_atoms} do not go "
+            f"with a {', '.join(known)} representation of {inner.num_atoms} atoms; make them alike"
+        )
+    return learned

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits
 from neuralq.learners.replay.distributional import DistributionalLearner
 from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead, has_hidden_units
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
-from neuralq.q import CategoricalQ, QuantileQ
 from neuralq.q.engine import Loss, TorchEngine
-from neuralq.types import QFunction
 
 __all__ = ["REPLAY"]
 
 
 def _build(parts: Parts) -> ReplayLearner | DistributionalLearner | DQRCLearner:
     settings: ReplaySettings = parts.settings
-    if settings.distribution != "none":
+    if settings.returns.description is not None:
         assert isinstance(parts.engine, TorchEngine)
-        return DistributionalLearner(parts.engine, settings, parts.reward_scale)
-    if settings.target_rule == "dqrc":
+        return DistributionalLearner(parts.engine, settings, parts.reward_scale, parts.rng)
+    if settings.rule.correction:
         head = TwinHead(parts.engine.q) if has_hidden_units(parts.engine.q) else parts.another()  # all 0, as it starts
         return DQRCLearner(parts.engine, head, _dqrc_settings(settings), parts.reward_scale)
     return ReplayLearner(parts.engine, settings, parts.reward_scale)
@@ -33,31 +29,14 @@ def _dqrc_settings(settings: ReplaySettings) -> DQRCSettings:
     return DQRCSettings(settings.learning_rate, rate_h, beta, settings.optimiser, settings.max_grad_norm)
 
 
-def _represent(q: QFunction, settings: ReplaySettings, reward_scale: float, rng: np.random.Generator) -> QFunction:
-    """The Q-function whose distribution ``q`` describes; else ``q`` itself."""
-    if settings.distribution == "none":
-        return q
-    assert settings.num_atoms is not None
-    if settings.distribution == "quantile":
-        return QuantileQ(q, settings.num_atoms)
-    low, high = settings.value_min, settings.value_max
-    assert low is not None and high is not None
-    return CategoricalQ(q, settings.num_atoms, low * reward_scale, high * reward_scale)
-
-
 def _check(settings: ReplaySettings, representation: Representation) -> None:
-    distribution, layout = settings.distribution, representation.layout
-    if distribution != "none" and layout in ("action-input", "separate"):
-        raise ValueError(
-            f"distribution={distribution!r} needs several outputs per action, and {layout} networks have one "
-            "output each; use layout='action-output', 'linear' or 'table'"
-        )
-    if representation.dueling and settings.target_rule == "dqrc":
+    settings.returns.check(settings, representation)
+    if representation.dueling and settings.rule.correction:
         raise ValueError(
             "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
             "leave dueling out"
         )
-    if representation.engine == "compiled" and distribution != "none":
+    if representation.engine == "compiled" and settings.returns.description is not None:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
@@ -77,8 +56,8 @@ REPLAY = LearnerKind(
         double=s.target_rule == "double",
     ),
     loss=lambda s: Loss("huber" if s.loss == "huber" else "squared"),
-    outputs=lambda s, layout: s.num_atoms or 1,
-    represent=_represent,
+    outputs=lambda s, layout: s.returns.outputs(s, layout),
+    represent=lambda q, s, reward_scale, rng: s.returns.represent(q, s, reward_scale, rng),
     check=_check,
     place=2,
 )

@@ -1,9 +1,7 @@
-"""Q-learning from stored experience: one-step, n-step, double and Munchausen targets, or λ-returns over blocks.
+"""Q-learning from stored experience, by any rule of `neuralq.rules.target_rules` that freezes its targets.
 
 One-step and n-step samples come ready from the replay buffer (its discount is that of the whole stretch), so the same
-rule serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in DQN(λ) (Daley & Amato, 2019): Peng's and
-Watkins', or with the corrections of Retrace, tree backup or Q(λ) towards an ε-greedy target policy. Of the policy that
-took the stored actions these know only the probabilities stored with them.
+rule serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in DQN(λ) (Daley & Amato, 2019).
 """
 
 from __future__ import annotations
@@ -14,12 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuralq import rules
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
-from neuralq.learners.replay.settings import CORRECTED_RULES, ReplaySettings
+from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
 from neuralq.q.engine import Engine
+from neuralq.rules import Seen
+from neuralq.rules.one_step import Q_LEARNING
 from neuralq.types import Array, Transition
 
 __all__ = ["ReplayLearner"]
@@ -49,7 +48,7 @@ class ReplayLearner:
     """
 
     def __init__(self, engine: Engine, settings: ReplaySettings, reward_scale: float = 1.0) -> None:
-        if settings.distribution != "none" or settings.target_rule == "dqrc":
+        if settings.returns.description is not None or settings.rule.correction:
             raise ValueError(
                 f"a ReplayLearner learns means from frozen targets, got distribution={settings.distribution!r} and "
                 f"target_rule={settings.target_rule!r}; use DistributionalLearner or DQRCLearner"
@@ -59,6 +58,8 @@ class ReplayLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._options = settings.options
+        self._is_plain = settings.rule is Q_LEARNING
         self._seen: Transition | None = None
         self._seen_arrays: tuple[Array, ...] | None = None
         engine.sync_target()
@@ -67,43 +68,11 @@ class ReplayLearner:
 
     def targets(self, transition: Transition) -> Tensor:
         """Targets of the chosen rule, with the shape of ``r_t``."""
-        q_t = self.engine.all(transition.s_t, target=True)
-        rule = self.settings.target_rule
-        if rule == "q_learning":
+        if self._is_plain:
+            q_t = self.engine.all(transition.s_t, target=True)
             return q_learning_targets(transition.r_t, transition.discount_t, q_t, self.reward_scale)
-        r_t = transition.r_t.to(q_t.dtype) * self.reward_scale
-        discount_t = transition.discount_t.to(q_t.dtype)
-        if rule == "double":
-            return rules.double_q(r_t, discount_t, q_t, self.engine.all(transition.s_t))
-        if rule in ("peng", "watkins"):
-            return rules.lambda_returns(r_t, discount_t, q_t.amax(-1), self._lambda(transition, q_t), transition.last_t)
-        q_tm1 = self.engine.all(transition.s_tm1, target=True)
-        a_tm1 = transition.a_tm1
-        if rule == "munchausen":
-            return rules.munchausen(r_t, discount_t, q_tm1, a_tm1, q_t, *self.settings.munchausen_numbers)
-        epsilon = self.settings.target_epsilon
-        assert rule in CORRECTED_RULES and epsilon is not None
-        v_t = rules.expected_value(q_t, rules.epsilon_greedy(q_t, epsilon))
-        c_tm1 = self._coefficients(q_tm1, epsilon, transition)
-        chosen = q_tm1.gather(-1, a_tm1[..., None])[..., 0]
-        return rules.off_policy_returns(chosen, r_t, discount_t, v_t, c_tm1, transition.last_t)
-
-    def _lambda(self, transition: Transition, q_t: Tensor) -> Tensor | float:
-        """Peng's λ, the same everywhere, or Watkins', cut where the next action was not greedy."""
-        if self.settings.target_rule == "peng":
-            return self.settings.lambda_
-        greedy = rules.is_greedy(self.engine.all(transition.s_tm1, target=True), transition.a_tm1)
-        return rules.watkins_lambda(self.settings.lambda_, greedy, q_t.dtype)
-
-    def _coefficients(self, q_tm1: Tensor, epsilon: float, transition: Transition) -> Tensor:
-        """How far the errors behind each row's action are followed."""
-        rule, lambda_ = self.settings.target_rule, self.settings.lambda_
-        if rule == "harutyunyan":
-            return torch.full_like(q_tm1[..., 0], lambda_)
-        pi = rules.epsilon_greedy(q_tm1, epsilon).gather(-1, transition.a_tm1[..., None])[..., 0]
-        if rule == "tree_backup":
-            return rules.tree_backup_coefficients(lambda_, pi)
-        return rules.retrace_coefficients(lambda_, pi, transition.mu_tm1)
+        seen = Seen(transition, self.engine.all, self.reward_scale, self.settings.lambda_, self._options)
+        return self.settings.rule.target(seen)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One descent step on a batch; ``weight``, shaped like ``r_t``, multiplies each sample's loss."""
@@ -128,7 +97,7 @@ class ReplayLearner:
         if transition is not self._seen:
             self._seen, self._seen_arrays = transition, None
             t, dtype = transition, self.engine.flat.values.dtype
-            plain = self._descent.on_arrays is not None and self.settings.target_rule == "q_learning"
+            plain = self._descent.on_arrays is not None and self._is_plain
             alike = t.r_t.dtype == t.discount_t.dtype == dtype and t.r_t.shape == t.discount_t.shape == t.a_tm1.shape
             if plain and alike and t.r_t.dim() == 1 and len(t.s_tm1) == len(t.s_t) == len(t.r_t):
                 self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))

@@ -7,28 +7,52 @@ the stored settings say what was done.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.distributions.record import Distribution, distributions
+from neuralq.rules import Option, TargetRule, target_rules
 
-__all__ = ["BLOCK_RULES", "CORRECTED_RULES", "DISTRIBUTIONS", "TARGET_RULES", "ReplaySettings"]
+__all__ = ["ReplaySettings"]
 
-CORRECTED_RULES = ("retrace", "tree_backup", "harutyunyan")
-BLOCK_RULES = ("peng", "watkins", *CORRECTED_RULES)
-TARGET_RULES = ("q_learning", "double", "munchausen", *BLOCK_RULES, "dqrc")
-DISTRIBUTIONS = ("none", "quantile", "categorical")
+_Class = TypeVar("_Class")
+
+
+def _options() -> dict[str, Option]:
+    """The options of all target rules by name."""
+    return {name: option for rule in target_rules().values() for name, option in rule.options.items()}
+
+
+def _listed(records: Iterable[Distribution] | Iterable[TargetRule]) -> str:
+    return ", ".join(f'"{record.name}" ({record.source})' for record in records)
+
+
+def _with_options(cls: type[_Class]) -> type[_Class]:
+    """A field for every option of a target rule that has none yet; what can be chosen goes into the text."""
+    text, rules, all_distributions = cls.__doc__ or "", target_rules().values(), distributions().values()
+    for name, option in _options().items():
+        if name not in cls.__annotations__:
+            cls.__annotations__[name] = "float | None"
+            setattr(cls, name, None)
+            text = f"{text.rstrip()}\n        {name}: {option.label}; None for {option.default}.\n    "
+    text = text.replace("SAMPLES", _listed(rule for rule in rules if not rule.blocks))
+    text = text.replace("BLOCKS", _listed(rule for rule in rules if rule.blocks))
+    text = text.replace("DISTRIBUTIONS", _listed(all_distributions))
+    atoms = [f"{one.num_atoms} ({one.name})" for one in all_distributions if one.num_atoms is not None]
+    cls.__doc__ = text.replace("ATOMS", ", ".join(atoms))
+    return cls
 
 
 @dataclass(frozen=True)
+@_with_options
 class ReplaySettings:
     """How a `ReplayLearner` and its relatives learn and what is stored. Defaults: DQN (Mnih et al., 2015), scaled down.
 
     Args:
-        target_rule: "q_learning", "double" (van Hasselt et al., 2016), "munchausen" (Vieillard et al., 2020) or "dqrc"
-            (Patterson et al., 2022); with block_length > 1 "peng", "watkins", "retrace", "tree_backup" or
-            "harutyunyan".
+        target_rule: SAMPLES; with block_length > 1 BLOCKS.
         num_steps: n of n-step targets.
         block_length: rows of a contiguous block for λ-returns; 1 for independent samples.
         lambda_: λ of the λ-returns.
@@ -44,11 +68,11 @@ class ReplaySettings:
         loss: "huber" or "squared"; None for the rule's own (Huber's; of dqrc squared, of categories cross-entropy).
         max_grad_norm: bound on the gradient's norm; None for none.
         prioritised: whether samples are drawn by |δ| (Schaul et al., 2016), with importance weights in the loss.
-        distribution: "none", "quantile" (QR-DQN, Dabney et al., 2018) or "categorical" (C51, Bellemare et al., 2017).
-        num_atoms: numbers that describe a distribution; None for 32 quantiles, 51 categories.
+        distribution: DISTRIBUTIONS.
+        num_atoms: numbers that describe a distribution; None for ATOMS.
         value_min: smallest return of a categorical distribution, in the environment's units.
         value_max: largest return of a categorical distribution, in the environment's units.
-        temperature: τ of munchausen's policy softmax(q/τ), in units of scaled rewards; None for 0.03.
+        temperature: τ of a rule's policy softmax(q/τ), in units of scaled rewards; None for 0.03.
         munchausen_alpha: α, how much of τ log π is added to the reward; None for 0.9.
         munchausen_floor: the smallest τ log π that counts, in units of scaled rewards; None for -1.
         target_epsilon: ε of the ε-greedy target policy of retrace, tree_backup and harutyunyan; None for 0.05.
@@ -90,8 +114,8 @@ class ReplaySettings:
             check_whole(name, getattr(self, name))
         check_fraction("lambda_", self.lambda_, "for Monte Carlo use lambda_=1")
         check_positive("learning_rate", self.learning_rate)
-        check_choice("target_rule", self.target_rule, TARGET_RULES)
-        check_choice("distribution", self.distribution, DISTRIBUTIONS)
+        check_choice("target_rule", self.target_rule, target_rules())
+        check_choice("distribution", self.distribution, distributions())
         Optimiser(self.optimiser)
         _check_blocks(self)
         _check_combination(self)
@@ -99,72 +123,56 @@ class ReplaySettings:
         self._check_own_numbers()
 
     @property
-    def munchausen_numbers(self) -> tuple[float, float, float]:
-        """Temperature τ, weight α and floor of the bonus.
+    def rule(self) -> TargetRule:
+        """The record of the target rule."""
+        return target_rules()[self.target_rule]
 
-        Raises:
-            ValueError: if the target rule is another.
-        """
-        numbers = (self.temperature, self.munchausen_alpha, self.munchausen_floor)
-        if numbers[0] is None or numbers[1] is None or numbers[2] is None:
-            raise ValueError(f"target_rule={self.target_rule!r} has no Munchausen bonus")
-        return numbers[0], numbers[1], numbers[2]
+    @property
+    def returns(self) -> Distribution:
+        """The record of what is learned of returns."""
+        return distributions()[self.distribution]
+
+    @property
+    def options(self) -> dict[str, float]:
+        """The target rule's own numbers by name."""
+        return {name: getattr(self, name) for name in self.rule.options}
 
     def _fill_in(self) -> None:
         """Numbers that the rule needs and nobody gave; those that it has no use for must not be given."""
-        rule, distribution = self.target_rule, self.distribution
-        dqrc, categorical = rule == "dqrc", distribution == "categorical"
-        losses = ("squared",) if dqrc else ("cross_entropy",) if categorical else ("huber", "squared")
-        _settle(self, "loss", losses[0], True, "")
-        if distribution == "quantile":
-            losses = ("huber",)
-        if self.loss not in losses:
-            what = "target_rule='dqrc'" if dqrc else f"distribution={distribution!r}"
-            check_choice("loss", self.loss, ("huber", "squared", "cross_entropy"))
-            raise ValueError(f"loss={self.loss!r} does not go with {what}, which has {losses[0]!r}; leave loss out")
-        no_copy = "target_rule='dqrc' corrects the gradient instead of freezing its targets"
-        _settle(self, "target_period_updates", 500, not dqrc, no_copy)
-        _settle(
-            self, "num_atoms", 51 if categorical else 32, distribution != "none", "distribution='none' has no atoms"
+        rule, learned, own = (
+            f"target_rule={self.target_rule!r}",
+            f"distribution={self.distribution!r}",
+            self.rule.options,
         )
-        unbounded = f"distribution={distribution!r} needs no range of returns"
+        losses = ("squared",) if self.rule.correction else self.returns.losses
+        _settle(self, "loss", losses[0], True, "")
+        if self.loss not in losses:
+            check_choice(
+                "loss", self.loss, dict.fromkeys(loss for one in distributions().values() for loss in one.losses)
+            )
+            what = rule if self.rule.correction else learned
+            raise ValueError(f"loss={self.loss!r} does not go with {what}, which has {losses[0]!r}; leave loss out")
+        _settle(self, "target_period_updates", 500, not self.rule.correction, f"{rule} {self.rule.correction}")
+        atoms = self.returns.num_atoms
+        _settle(self, "num_atoms", atoms, atoms is not None, f"{learned} has no atoms")
         for name in ("value_min", "value_max"):
-            _settle(self, name, None, categorical, unbounded)
-        for name, default in (("temperature", 0.03), ("munchausen_alpha", 0.9), ("munchausen_floor", -1.0)):
-            _settle(self, name, default, rule == "munchausen", f"target_rule={rule!r} has no softmax policy")
-        hard = f"target_rule={rule!r} has the greedy target policy"
-        _settle(self, "target_epsilon", 0.05, rule in CORRECTED_RULES, hard)
-        for name, value in (("dqrc_beta", 1.0), ("dqrc_learning_rate", self.learning_rate)):
-            _settle(self, name, value, dqrc, f"target_rule={rule!r} has no second function")
+            _settle(self, name, None, self.returns.bounded, f"{learned} needs no range of returns")
+        own = self.rule.options
+        for name, option in (_options() | dict(own)).items():
+            default = getattr(self, option.default) if isinstance(option.default, str) else option.default
+            _settle(self, name, default, name in own, f"{rule} {option.lack}")
 
     def _check_own_numbers(self) -> None:
-        for name, least in (
-            ("target_period_updates", 1),
-            ("num_atoms", 2 if self.distribution == "categorical" else 1),
-        ):
+        for name, least in (("target_period_updates", 1), ("num_atoms", self.returns.least_atoms)):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), least)
-        for name in ("temperature", "dqrc_learning_rate"):
-            if getattr(self, name) is not None:
-                check_positive(name, getattr(self, name))
-        for name in ("munchausen_alpha", "target_epsilon"):
-            if getattr(self, name) is not None:
-                check_fraction(name, getattr(self, name))
-        if self.dqrc_beta:
-            check_positive("dqrc_beta", self.dqrc_beta)
-        if self.munchausen_floor is not None and not self.munchausen_floor < 0:
-            raise ValueError(f"munchausen_floor must be below 0, got {self.munchausen_floor!r}; -1 is usual")
-        if self.distribution == "categorical":
-            low, high = self.value_min, self.value_max
-            if low is None or high is None or not -float("inf") < low < high < float("inf"):
-                raise ValueError(
-                    f"a categorical distribution needs value_min below value_max, got {low!r} and {high!r}; name the "
-                    "smallest and the largest return to expect, or take distribution='quantile', which needs neither"
-                )
-        if self.target_rule in ("retrace", "tree_backup") and self.target_epsilon == 0:
+        for name, option in self.rule.options.items():
+            option.check(name, getattr(self, name))
+        low, high = self.value_min, self.value_max
+        if self.returns.bounded and (low is None or high is None or not -float("inf") < low < high < float("inf")):
             raise ValueError(
-                f"with the greedy target policy target_rule={self.target_rule!r} is Watkins' Q(λ); use "
-                "target_rule='watkins', or target_epsilon above 0"
+                f"a {self.distribution} distribution needs value_min below value_max, got {low!r} and {high!r}; name "
+                "the smallest and the largest return to expect, or take distribution='quantile', which needs neither"
             )
 
 
@@ -177,9 +185,9 @@ def _settle(settings: ReplaySettings, name: str, default: Any, applies: bool, wh
 
 
 def _check_blocks(settings: ReplaySettings) -> None:
-    blocks = settings.target_rule in BLOCK_RULES
+    blocks = settings.rule.blocks
     if blocks != (settings.block_length > 1):
-        named = ", ".join(f'"{rule}"' for rule in BLOCK_RULES)
+        named = ", ".join(f'"{rule.name}"' for rule in target_rules().values() if rule.blocks)
         raise ValueError(
             f"target_rule={settings.target_rule!r} does not go with block_length={settings.block_length}: λ-returns "
             f"({named}) need blocks of at least 2 rows, the other rules take single samples"
@@ -202,26 +210,12 @@ def _check_blocks(settings: ReplaySettings) -> None:
 
 
 def _check_combination(settings: ReplaySettings) -> None:
-    rule, distribution = settings.target_rule, settings.distribution
-    if rule == "munchausen" and settings.num_steps > 1:
-        raise ValueError(
-            f"munchausen adds a bonus to every reward and an n-step sample holds only their sum, got num_steps="
-            f"{settings.num_steps}; leave num_steps=1"
-        )
-    if distribution == "none":
-        return
-    if rule in BLOCK_RULES:
-        raise ValueError(
-            f"target_rule={rule!r} mixes means and distribution={distribution!r} needs whole distributions; use "
-            "q_learning or double, with num_steps above 1 for longer returns"
-        )
-    if rule == "dqrc":
-        raise ValueError(
-            f"dqrc corrects the gradient of a squared error, which distribution={distribution!r} does not have; use "
-            "distribution='none', or another target_rule"
-        )
-    if rule == "munchausen" and distribution == "categorical":
-        raise ValueError(
-            "munchausen's soft values lie up to temperature · log A above every return, outside the grid of a "
-            "categorical distribution; use distribution='quantile'"
-        )
+    """What the rule says it does not go with, in its words."""
+    met = {
+        "num_steps": settings.num_steps > 1,
+        "distribution": settings.returns.description is not None,
+        "bounded": settings.returns.bounded,
+    }
+    for ground, why in settings.rule.refuses.items():
+        if met[ground]:
+            raise ValueError(why.format(distribution=settings.distribution, num_steps=settings.num_steps))
