@@ -196,7 +196,7 @@ def test_the_learner_with_its_own_drop_taken_out_fails(monkeypatch: pytest.Monke
     learner = OnlineLearner(engine, settings())
     close = learner._core.traces.close
     monkeypatch.setattr(
-        learner._core.traces, "close", lambda env_index, d, v, last: close(env_index, d, v, last & False)
+        learner._core.traces, "close", lambda discount, last, moved: close(discount, last & False, moved)
     )
     assert float((frozen_sum(learner, t) - forward(t, copy.deepcopy(engine.q))).abs().max()) > 1e-3
 

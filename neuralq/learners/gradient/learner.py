@@ -30,6 +30,7 @@ from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
 from neuralq.learners.learner import Update
+from neuralq.learners.traces.memory import restore, state_of
 from neuralq.q.compiled import MlpEngine
 from neuralq.q.engine import Engine
 from neuralq.types import Transition
@@ -76,12 +77,8 @@ class GradientPredictionLearner:
             raise ValueError("prediction has no exploring actions to cut at; leave cut at its default")
         self.engine = engine
         self.settings = settings
+        self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
-
-    @property
-    def num_updates(self) -> int:
-        """Updates so far."""
-        return self._core.num_updates
 
     def increments(
         self, transition: Transition, rho_tm1: Tensor | None = None, weight: Tensor | None = None
@@ -115,7 +112,9 @@ class GradientPredictionLearner:
             ValueError: if there are traces and the number of rows is not that of the environments.
         """
         increment, increment_h, seen = self.increments(transition, rho_tm1, weight)
-        self._core.apply(increment, increment_h)
+        self.engine.flat.values.add_(increment)
+        self._core.correction.values.add_(increment_h)
+        self.num_updates += 1
         return seen
 
     def begin_streams(self) -> None:
@@ -124,11 +123,12 @@ class GradientPredictionLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, those of h, traces and counters."""
-        return self._core.state_dict()
+        return state_of(self, h=self._core.correction.values, traces=self._core.traces.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self._core.load_state_dict(state)
+        restore(self, state, traces=self._core.traces.state_dict())
+        self._core.correction.load(torch.as_tensor(state["h"]))
 
 
 class GradientQLearner:
@@ -181,19 +181,15 @@ class GradientQLearner:
         self.settings = settings
         self.reward_scale = reward_scale
         self.policy = policy
+        self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
-
-    @property
-    def num_updates(self) -> int:
-        """Updates so far."""
-        return self._core.num_updates
 
     @property
     def engine_name(self) -> str:
         """What computes: "torch", or where there are kernels for values "compiled and torch"."""
         return "compiled and torch" if isinstance(self.engine, MlpEngine) else "torch"
 
-    def _keep(self, transition: Transition, like: Tensor) -> Tensor:
+    def _trace_decay(self, transition: Transition, like: Tensor) -> Tensor:
         """How much of the older traces survives the action taken, ``[N]``."""
         if not self.settings.lambda_ or (self.settings.cut == "naive" and self.policy is None):
             return torch.ones_like(like)
@@ -220,14 +216,16 @@ class GradientQLearner:
             bootstrap=bootstrap,
             target=r_t + bootstrap.detach(),
             rho=torch.ones_like(r_t),
-            trace_decay=self._keep(transition, r_t),
+            trace_decay=self._trace_decay(transition, r_t),
         )
         return self._core.increments(transition, seen, weight)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from one step of every environment, ``[N]``; increments are summed, rows of weight 0 did not move."""
         increment, increment_h, seen = self.increments(transition, weight)
-        self._core.apply(increment, increment_h)
+        self.engine.flat.values.add_(increment)
+        self._core.correction.values.add_(increment_h)
+        self.num_updates += 1
         return seen
 
     def begin_streams(self) -> None:
@@ -236,8 +234,9 @@ class GradientQLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, those of h, traces and counters."""
-        return self._core.state_dict()
+        return state_of(self, h=self._core.correction.values, traces=self._core.traces.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self._core.load_state_dict(state)
+        restore(self, state, traces=self._core.traces.state_dict())
+        self._core.correction.load(torch.as_tensor(state["h"]))

@@ -23,6 +23,7 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
+from neuralq.learners.traces.memory import restore, state_of
 from neuralq.q.engine import Engine
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import Transition
@@ -191,16 +192,8 @@ class ResidualGradientLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, averages and counters."""
-        return {
-            "num_updates": self.num_updates,
-            "parameters": self.engine.flat.values,
-            "direct": self._direct,
-            "residual": self._residual,
-        }
+        return state_of(self, direct=self._direct, residual=self._residual)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        self._direct.copy_(torch.as_tensor(state["direct"]))
-        self._residual.copy_(torch.as_tensor(state["residual"]))
+        restore(self, state, direct=self._direct, residual=self._residual)

@@ -17,9 +17,7 @@ z ← ρ(γλ z + ∇V), and the h in c.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,6 +27,7 @@ from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import gradient_rows, module_parameters
 from neuralq.learners.learner import Update
+from neuralq.learners.traces.memory import Traces
 from neuralq.q.engine import Engine
 from neuralq.types import Transition
 
@@ -84,7 +83,7 @@ class TDStep:
         bootstrap: γ times the value of the successor, ``[N]``, with its graph.
         target: reward plus bootstrap, ``[N]``, without.
         rho: factor of the whole traces, this step included, ``[N]``.
-        keep: factor of what the traces held before, ``[N]``.
+        trace_decay: factor of what the traces held before, besides γλ, ``[N]``.
     """
 
     s: Tensor
@@ -96,55 +95,8 @@ class TDStep:
     trace_decay: Tensor
 
 
-class _Traces:
-    """Named traces ``[environments, *]`` with the decay that is due; without λ there is nothing to remember."""
-
-    def __init__(self, lambda_: float, widths: Mapping[str, int], like: Tensor, num_envs: int) -> None:
-        self.lambda_ = lambda_
-        self.num_envs = num_envs
-        self.z = {name: like.new_zeros(num_envs, width) for name, width in widths.items()} if lambda_ else {}
-        self.decay = like.new_zeros(num_envs)
-
-    def check(self, num_rows: int) -> None:
-        if self.lambda_ and num_rows != self.num_envs:
-            raise ValueError(
-                f"this learner has traces for {self.num_envs} streams, got a transition of {num_rows} rows; set "
-                "num_envs, or lambda_=0 to learn from independent samples"
-            )
-
-    def grow(self, name: str, fresh: Tensor, seen: TDStep, moved: Tensor) -> Tensor:
-        """``ρ (keep · decay · z + fresh)`` where the environment moved, ``[N, k]``."""
-        if not self.lambda_:
-            return seen.rho[:, None] * fresh
-        before = rules.cut(self.z[name], seen.trace_decay == 0)
-        grown = seen.rho[:, None] * rules.accumulate(before, fresh, self.decay * seen.trace_decay)
-        self.z[name] = torch.where(moved[:, None], grown, self.z[name])
-        return grown
-
-    def close(self, transition: Transition, moved: Tensor) -> None:
-        """The discount into the next state is due; everything is dropped after the last step of a stream."""
-        if not self.lambda_:
-            return
-        ends = transition.last_t & moved
-        due = self.lambda_ * transition.discount_t.to(self.decay.dtype)
-        self.decay = torch.where(moved, due, self.decay).masked_fill(ends, 0.0)
-        self.z = {name: rules.cut(z, ends) for name, z in self.z.items()}
-
-    def clear(self) -> None:
-        for trace in (*self.z.values(), self.decay):
-            trace.zero_()
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"decay": self.decay, **self.z}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.decay.copy_(torch.as_tensor(state["decay"]))
-        for name, trace in self.z.items():
-            trace.copy_(torch.as_tensor(state[name]))
-
-
 class GradientStep:
-    """What prediction and control share: both updates, and where the state lives.
+    """What prediction and control share: the traces, and both updates.
 
     Args:
         engine: values of the representation.
@@ -158,30 +110,35 @@ class GradientStep:
         self.correction = correction
         self.settings = settings
         self.parameters = module_parameters(engine.q)
-        self.num_updates = 0
+        self.num_envs = num_envs
         d, k = engine.flat.values.numel(), correction.values.numel()
-        widths = {"grad": d, **({"curvature": d} if correction.tangent else {"h": 1, "h_grad": k})}
-        self.traces = _Traces(settings.lambda_, widths, engine.flat.values, num_envs)
+        shapes = {"grad": (d,), **({"curvature": (d,)} if correction.tangent else {"h": (1,), "h_grad": (k,)})}
+        # Without λ there is nothing to remember.
+        self.traces = Traces(settings.lambda_, num_envs, engine.flat.values, shapes if settings.lambda_ else {})
 
     def increments(self, transition: Transition, seen: TDStep, weight: Tensor | None) -> tuple[Tensor, Tensor, Update]:
         """What to add to the values ``[d]`` and to h ``[k]``; the traces move on."""
-        self.traces.check(len(seen.q))
+        if self.settings.lambda_ and len(seen.q) != self.num_envs:
+            raise ValueError(
+                f"this learner has traces for {self.num_envs} streams, got a transition of {len(seen.q)} rows; set "
+                "num_envs, or lambda_=0 to learn from independent samples"
+            )
         weight = torch.ones_like(seen.target) if weight is None else weight.to(seen.target)
         moved = weight != 0
         delta = seen.target - seen.q.detach()
         grad = gradient_rows(seen.q, self.parameters)
         estimate = self.correction.estimate(seen.s, seen.a, seen.q, grad)
         h = estimate.h
-        z = self.traces.grow("grad", grad, seen, moved)
+        z = self._grown("grad", grad, seen, moved)
         main = delta[:, None] * z if self.settings.method == "tdc" else h[:, None] * grad
         if estimate.curvature is not None:
             # h is linear in its own parameters, and its gradient is ∇V: the trace of h needs no memory of old h.
             z_h_grad, z_h = z, z @ self.correction.values
-            z_curvature = self.traces.grow("curvature", estimate.curvature, seen, moved)
+            z_curvature = self._grown("curvature", estimate.curvature, seen, moved)
             main = main - delta[:, None] * z_curvature + h[:, None] * estimate.curvature
         else:
-            z_h_grad = self.traces.grow("h_grad", estimate.grad, seen, moved)
-            z_h = self.traces.grow("h", h[:, None], seen, moved)[:, 0]
+            z_h_grad = self._grown("h_grad", estimate.grad, seen, moved)
+            z_h = self._grown("h", h[:, None], seen, moved)[:, 0]
         grad_t = gradient_rows(seen.bootstrap, self.parameters)
         direction = main + (z_h - seen.rho * h)[:, None] * grad - z_h[:, None] * grad_t
         regression = delta[:, None] * z_h_grad - h[:, None] * estimate.grad
@@ -189,31 +146,20 @@ class GradientStep:
         along = weight @ torch.where(moved[:, None], direction, 0.0)
         along_h = weight @ torch.where(moved[:, None], regression, 0.0)
         along_h = along_h - weight.sum() * self.settings.beta * self.correction.values
-        self.traces.close(transition, moved)
+        if self.settings.lambda_:
+            self.traces.close(transition.discount_t, transition.last_t, moved)
         return (
             self.settings.step_size * along,
             self.settings.step_size_h * along_h,
             Update(torch.where(moved, delta, 0.0), seen.target),
         )
 
-    def apply(self, increment: Tensor, increment_h: Tensor) -> None:
-        """Take the step."""
-        self.engine.flat.values.add_(increment)
-        self.correction.values.add_(increment_h)
-        self.num_updates += 1
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, those of h, traces and counters."""
-        return {
-            "num_updates": self.num_updates,
-            "parameters": self.engine.flat.values,
-            "h": self.correction.values,
-            "traces": self.traces.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        self.correction.load(torch.as_tensor(state["h"]))
-        self.traces.load_state_dict(state["traces"])
+    def _grown(self, name: str, fresh: Tensor, seen: TDStep, moved: Tensor) -> Tensor:
+        """The trace ``ρ (trace_decay · decay · z + fresh)``, ``[N, k]``; it is kept where the environment moved."""
+        if not self.settings.lambda_:
+            return seen.rho[:, None] * fresh
+        z = self.traces.z
+        before = rules.cut(z[name], seen.trace_decay == 0)
+        grown = seen.rho[:, None] * rules.accumulate(before, fresh, self.traces.decay * seen.trace_decay)
+        z[name] = torch.where(moved[:, None], grown, z[name])
+        return grown

@@ -19,6 +19,7 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
+from neuralq.learners.traces.memory import Traces, restore, state_of
 from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
@@ -54,8 +55,8 @@ class OnlineSettings:
             raise ValueError("the true online increment is not derived for uncut Q(λ); leave cut='watkins'")
 
 
-class _Traces:
-    """Traces ``[N, k, d]`` with the decay that is due and the value before the last update, per environment."""
+class _Core:
+    """What control and prediction share: a trace for every environment and output, and the step along it."""
 
     def __init__(self, engine: Engine, settings: OnlineSettings, num_envs: int, num_outputs: int) -> None:
         inner = engine.q.inner if isinstance(engine.q, MaskedQ) else engine.q
@@ -64,76 +65,53 @@ class _Traces:
                 "dutch traces and the true online increment hold for tables and linear features only, got "
                 f"{type(inner).__name__}; use trace='accumulating'"
             )
-        self.settings = settings
+        self.engine, self.settings = engine, settings
         values = engine.flat.values
-        self.z = values.new_zeros(num_envs, num_outputs, values.numel())
-        self.decay = values.new_zeros(num_envs)
-        self.v_old = values.new_zeros(num_envs, num_outputs)
+        shapes = {"z": (num_outputs, values.numel()), "v_old": (num_outputs,)}  # v_old: V before the last update
+        self.traces = Traces(settings.lambda_, num_envs, values, shapes)
 
-    def grow(self, env_index: int, output: int, grad: Tensor) -> Tensor:
-        """Decay and add the gradient; returns the trace ``[d]``."""
-        z, decay = self.z[env_index, output], self.decay[env_index]
-        if self.settings.trace == "accumulating":
-            z = rules.accumulate(z, grad, decay)
-        elif self.settings.trace == "replacing":
-            z = rules.replace(z, grad, decay)
-        else:
-            z = rules.dutch(z, grad, decay, self.settings.step_size)
-        self.z[env_index, output] = z
-        return z
+    def increment(
+        self,
+        transition: Transition,
+        outputs: Tensor,
+        targets: Tensor,
+        v_t: Tensor,
+        explored: Tensor | None = None,
+        rho_tm1: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """What to add to the weights ``[d]``, and the errors of ``outputs``, all ``[N, k]``; the traces move on."""
+        z, v_old = self.traces.z["z"], self.traces.z["v_old"]
+        total, errors = torch.zeros_like(self.engine.flat.values), torch.zeros_like(targets)
+        for i in range(len(targets)):
+            if weight is not None and weight[i] == 0:
+                continue
+            if explored is not None:
+                z[i].masked_fill_(explored[i], 0.0)
+            for k in range(targets.shape[1]):
+                v_tm1 = self.engine.value_gradient(transition.s_tm1[i], outputs[i, k])
+                grad = self.engine.flat.grad
+                trace = self._grown(z[i, k], grad, self.traces.decay[i])
+                if rho_tm1 is not None:
+                    # The ratio multiplies the whole trace, once: z = ρ(γλz + ∇V); the increment uses δ unweighted.
+                    trace = rho_tm1[i] * trace
+                z[i, k] = trace
+                delta = targets[i, k] - v_tm1
+                errors[i, k] = delta
+                if self.settings.trace == "dutch":
+                    alpha = self.settings.step_size
+                    total += rules.true_online_increment(trace, grad, delta, v_tm1, v_old[i, k], alpha)
+                else:
+                    total += self.settings.step_size * delta * trace
+            v_old[i] = v_t[i]
+        self.traces.close(transition.discount_t, transition.last_t, None if weight is None else weight != 0)
+        return total, errors
 
-    def increment(self, env_index: int, output: int, z: Tensor, grad: Tensor, delta: Tensor, v_tm1: Tensor) -> Tensor:
-        """What this environment and output add to the weights, ``[d]``."""
-        if self.settings.trace != "dutch":
-            return self.settings.step_size * delta * z
-        v_old = self.v_old[env_index, output]
-        return rules.true_online_increment(z, grad, delta, v_tm1, v_old, self.settings.step_size)
-
-    def close(self, env_index: int, discount_t: Tensor, v_t: Tensor, last: Tensor) -> None:
-        """Remember the discount into the next state; drop everything after the last step of a stream.
-
-        ``last`` is not asked whether it is true: an accelerator would have to be waited for.
-        """
-        self.decay[env_index] = discount_t * self.settings.lambda_
-        self.v_old[env_index] = v_t
-        for state in (self.z, self.decay, self.v_old):
-            state[env_index].masked_fill_(last, 0.0)
-
-    def clear(self) -> None:
-        for state in (self.z, self.decay, self.v_old):
-            state.zero_()
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"z": self.z, "decay": self.decay, "v_old": self.v_old}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for mine, saved in ((self.z, state["z"]), (self.decay, state["decay"]), (self.v_old, state["v_old"])):
-            mine.copy_(torch.as_tensor(saved))
-
-
-class _TraceLearner:
-    """What control and prediction share: the step along the traces, and where the state lives."""
-
-    def __init__(self, engine: Engine, traces: _Traces) -> None:
-        self.engine = engine
-        self.traces = traces
-        self.num_updates = 0
-
-    def apply(self, increment: Tensor) -> None:
-        self.engine.flat.values.add_(increment)
-        self.num_updates += 1
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "num_updates": self.num_updates,
-            "parameters": self.engine.flat.values,
-            "traces": self.traces.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.num_updates = int(state["num_updates"])
-        self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        self.traces.load_state_dict(state["traces"])
+    def _grown(self, z: Tensor, grad: Tensor, decay: Tensor) -> Tensor:
+        """The trace ``[d]`` decayed, with the gradient."""
+        if self.settings.trace == "dutch":
+            return rules.dutch(z, grad, decay, self.settings.step_size)
+        return (rules.accumulate if self.settings.trace == "accumulating" else rules.replace)(z, grad, decay)
 
 
 class OnlineLearner:
@@ -168,40 +146,27 @@ class OnlineLearner:
         self.engine = engine
         self.settings = settings
         self.reward_scale = reward_scale
-        self._core = _TraceLearner(engine, _Traces(engine, settings, num_envs, 1))
-
-    @property
-    def num_updates(self) -> int:
-        """Updates so far."""
-        return self._core.num_updates
+        self.num_updates = 0
+        self._core = _Core(engine, settings, num_envs, 1)
 
     def increment(self, transition: Transition, weight: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
-        traces, dtype = self._core.traces, self.engine.flat.values.dtype
+        dtype = self.engine.flat.values.dtype
         q_t = self.engine.all(transition.s_t)
         r_t = transition.r_t.to(dtype) * self.reward_scale
-        discount_t = transition.discount_t.to(dtype)
-        targets = rules.q_learning(r_t, discount_t, q_t)
-        explored = ~rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
-        total = torch.zeros_like(self.engine.flat.values)
-        errors = torch.zeros_like(targets)
-        for env_index in range(len(targets)):
-            if weight is not None and weight[env_index] == 0:
-                continue
-            if self.settings.cut == "watkins":
-                traces.z[env_index].masked_fill_(explored[env_index], 0.0)
-            q = self.engine.value_gradient(transition.s_tm1[env_index], transition.a_tm1[env_index])
-            grad = self.engine.flat.grad
-            z = traces.grow(env_index, 0, grad)
-            errors[env_index] = targets[env_index] - q
-            total += traces.increment(env_index, 0, z, grad, errors[env_index], q)
-            traces.close(env_index, discount_t[env_index], q_t[env_index].amax(), transition.last_t[env_index])
-        return total, Update(errors, targets)
+        targets = rules.q_learning(r_t, transition.discount_t.to(dtype), q_t)
+        explored = None
+        if self.settings.cut == "watkins":
+            explored = ~rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
+        columns = transition.a_tm1[:, None], targets[:, None], q_t.amax(-1, keepdim=True)
+        total, errors = self._core.increment(transition, *columns, explored, weight=weight)
+        return total, Update(errors[:, 0], targets)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from one step of every environment, ``[N]``; environments of weight 0 did not move."""
         total, seen = self.increment(transition, weight)
-        self._core.apply(total)
+        self.engine.flat.values.add_(total)
+        self.num_updates += 1
         return seen
 
     def begin_streams(self) -> None:
@@ -210,11 +175,11 @@ class OnlineLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, traces and counters."""
-        return self._core.state_dict()
+        return state_of(self, traces=self._core.traces.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self._core.load_state_dict(state)
+        restore(self, state, traces=self._core.traces.state_dict())
 
 
 class PredictionLearner:
@@ -245,35 +210,17 @@ class PredictionLearner:
             raise ValueError("prediction has no exploring actions to cut at; leave cut at its default")
         self.engine = engine
         self.settings = settings
-        self.num_outputs = engine.q.num_actions
-        self._core = _TraceLearner(engine, _Traces(engine, settings, num_envs, self.num_outputs))
-
-    @property
-    def num_updates(self) -> int:
-        """Updates so far."""
-        return self._core.num_updates
+        self.num_updates = 0
+        self._core = _Core(engine, settings, num_envs, engine.q.num_actions)
 
     def increment(self, transition: Transition, rho_tm1: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
-        traces, dtype = self._core.traces, self.engine.flat.values.dtype
         v_t = self.engine.all(transition.s_t)
-        r_t = transition.r_t.to(dtype).reshape(len(v_t), -1).expand_as(v_t)
-        discount_t = transition.discount_t.to(dtype)
+        r_t = transition.r_t.to(v_t.dtype).reshape(len(v_t), -1).expand_as(v_t)
+        discount_t = transition.discount_t.to(v_t.dtype)
         targets = rules.one_step(r_t, discount_t[:, None].expand_as(v_t), v_t)
-        total = torch.zeros_like(self.engine.flat.values)
-        errors = torch.zeros_like(targets)
-        for env_index in range(len(targets)):
-            for output in range(self.num_outputs):
-                v = self.engine.value_gradient(transition.s_tm1[env_index], torch.tensor(output, device=v_t.device))
-                grad = self.engine.flat.grad
-                z = traces.grow(env_index, output, grad)
-                if rho_tm1 is not None:
-                    # The ratio multiplies the whole trace, once: z = ρ(γλz + ∇V); the increment uses δ unweighted.
-                    z = rho_tm1[env_index] * z
-                    traces.z[env_index, output] = z
-                errors[env_index, output] = targets[env_index, output] - v
-                total += traces.increment(env_index, output, z, grad, errors[env_index, output], v)
-            traces.close(env_index, discount_t[env_index], v_t[env_index], transition.last_t[env_index])
+        outputs = torch.arange(v_t.shape[1], device=v_t.device).expand_as(v_t)
+        total, errors = self._core.increment(transition, outputs, targets, v_t, rho_tm1=rho_tm1)
         return total, Update(errors, targets)
 
     def update(self, transition: Transition, rho_tm1: Tensor | None = None) -> Update:
@@ -289,7 +236,8 @@ class PredictionLearner:
         if rho_tm1 is not None and self.settings.trace == "dutch":
             raise ValueError("the true online increment is on-policy; use accumulating traces with importance ratios")
         total, seen = self.increment(transition, rho_tm1)
-        self._core.apply(total)
+        self.engine.flat.values.add_(total)
+        self.num_updates += 1
         return seen
 
     def begin_streams(self) -> None:
@@ -298,11 +246,11 @@ class PredictionLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, traces and counters."""
-        return self._core.state_dict()
+        return state_of(self, traces=self._core.traces.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self._core.load_state_dict(state)
+        restore(self, state, traces=self._core.traces.state_dict())
 
 
 ONLINE = LearnerKind(

@@ -30,6 +30,7 @@ from neuralq.checks import check_choice, check_discount, check_fraction, check_p
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.traces import streaming_kernels as kernels
+from neuralq.learners.traces.memory import restore, state_of
 from neuralq.q.engine import Engine
 from neuralq.q.single_row import SingleRowNetwork, runs_single_row
 from neuralq.rules import streaming as bounds
@@ -115,7 +116,6 @@ class _Steps:
         self.v = torch.zeros_like(values) if settings.bound != "obgd" else values.new_zeros(0)
         self.means = torch.tensor([0.0, 1.0], dtype=torch.float64, device=values.device)
         self.decay = values.new_zeros(())
-        self.num_updates = 0
         if values.device.type == "cpu":  # the same memory, as the kernels see it
             self._memory: Any = tuple(x.numpy() for x in (values, self.z, self.v, engine.flat.grad, self.means))
             self._decay: Any = self.decay.numpy()
@@ -124,9 +124,9 @@ class _Steps:
             settings.second_moment_decay, 1.0 - self.gamma_lambda,
         )  # fmt: skip
 
-    def advance(self, delta: Tensor) -> None:
-        """Grow the trace by ``flat.grad`` and move the weights."""
-        settings, t = self.settings, self.num_updates + 1
+    def advance(self, delta: Tensor, t: int) -> None:
+        """Decay the trace, add ``flat.grad`` and move the weights: step ``t``, from 1."""
+        settings = self.settings
         alpha, kappa, beta2 = settings.eta_or_alpha, settings.overshoot_bound, settings.second_moment_decay
         grad = self.engine.flat.grad
         self.z.copy_(rules.accumulate(self.z, grad, self.decay))
@@ -142,21 +142,15 @@ class _Steps:
             self.v.copy_(v)
             self.means.copy_(means)
         self.engine.flat.values.add_(step)
-        self.num_updates = t
 
-    def advance_compiled(self, delta: float) -> None:
+    def advance_compiled(self, delta: float, t: int) -> None:
         """As `advance`, in two passes over the memory."""
-        self.num_updates += 1
-        arguments: Any = (*self._memory, float(self._decay), delta, *self._constants, self.num_updates)
+        arguments: Any = (*self._memory, float(self._decay), delta, *self._constants, t)
         kernels.advance(*arguments)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Tensor]:
         state = {"z": self.z, "decay": self.decay, "means": self.means}
         return state if self.settings.bound == "obgd" else {**state, "v": self.v}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for name, mine in self.state_dict().items():
-            mine.copy_(torch.as_tensor(state[name]))
 
 
 class StreamingLearner:
@@ -203,14 +197,10 @@ class StreamingLearner:
         self.engine = engine
         self.settings = settings
         self.reward_scale = reward_scale
+        self.num_updates = 0
         self._steps = _Steps(engine, settings, discount)
         self._compiled = kind != "torch" and on_cpu
         self._network = SingleRowNetwork(engine) if self._compiled and runs_single_row(engine.q) else None
-
-    @property
-    def num_updates(self) -> int:
-        """Updates so far."""
-        return self._steps.num_updates
 
     @property
     def engine_name(self) -> str:
@@ -236,7 +226,9 @@ class StreamingLearner:
         if weight is not None and float(weight[0]) == 0:
             nothing = self.engine.flat.values.new_zeros(1)
             return Update(nothing, nothing.clone())
-        return self._update_compiled(transition) if self._compiled else self._update(transition)
+        seen = self._update_compiled(transition) if self._compiled else self._update(transition)
+        self.num_updates += 1
+        return seen
 
     def _seen(self, transition: Transition) -> tuple[Tensor, Tensor, Tensor]:
         """Q(s, a) ``[]``, the one-step target ``[]`` and whether a was greedy ``[]``; leaves the gradient behind."""
@@ -253,7 +245,7 @@ class StreamingLearner:
         if exact:
             steps.z.copy_(rules.cut(steps.z, ~greedy))
         delta = target - value
-        steps.advance(delta)
+        steps.advance(delta, self.num_updates + 1)
         last = transition.last_t[0]
         steps.z.copy_(rules.cut(steps.z, last if exact else last | ~greedy))
         steps.decay.copy_(transition.discount_t[0] * self.settings.lambda_)
@@ -272,7 +264,7 @@ class StreamingLearner:
         if exact and not greedy:
             steps.z.zero_()
         delta = target - value
-        steps.advance_compiled(delta)
+        steps.advance_compiled(delta, self.num_updates + 1)
         if transition.last_t.item() or not (exact or greedy):
             steps.z.zero_()
         steps.decay.fill_(discount_t * self.settings.lambda_)
@@ -286,17 +278,11 @@ class StreamingLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, trace, running means and counter."""
-        return {
-            "num_updates": self._steps.num_updates,
-            "parameters": self.engine.flat.values,
-            "steps": self._steps.state_dict(),
-        }
+        return state_of(self, steps=self._steps.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self._steps.num_updates = int(state["num_updates"])
-        self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        self._steps.load_state_dict(state["steps"])
+        restore(self, state, steps=self._steps.state_dict())
 
 
 def _build(parts: Parts) -> StreamingLearner:
