@@ -4,40 +4,63 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import contextvars
+import difflib
 import importlib
+import itertools
 import json
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-__all__ = ["COMMANDS", "Failure", "command_parser", "main", "print_result"]
+__all__ = [
+    "COMMANDS",
+    "Command",
+    "CommandParser",
+    "Failure",
+    "command_parser",
+    "main",
+    "option_as_typed",
+    "parser_of",
+    "print_result",
+]
+
+
+class Command(NamedTuple):
+    """A command: where it lives, what it does in a line, and under what it stands in the help."""
+
+    module: str
+    function: str
+    summary: str
+    group: str
+
+
+_LOOK, _KNOW, _EXACT, _PLAY = "train and look", "know before training", "exact answers, and the book", "play and begin"
+
+
+def _of(module: str, function: str, summary: str, group: str) -> Command:
+    return Command(f"neuralq.apps.cli.{module}", function, summary, group)
+
 
 COMMANDS = {
-    "train": ("neuralq.apps.cli.runs", "train", "train on a Gymnasium environment, or td-gammon, by TD(λ)"),
-    "resume": ("neuralq.apps.cli.runs", "resume", "go on with a run that was stopped or killed"),
-    "evaluate": ("neuralq.apps.cli.runs", "evaluate", "play greedy episodes with a trained run"),
-    "report": ("neuralq.apps.cli.runs", "report", "write a run's report.html"),
-    "compare": ("neuralq.apps.cli.compare", "compare", "table and plot of several runs or sweeps side by side"),
-    "presets": ("neuralq.apps.cli.presets", "presets", "list the tuned settings per environment"),
-    "watch": ("neuralq.apps.cli.media", "watch", "watch a trained run play in a window"),
-    "record": ("neuralq.apps.cli.media", "record", "film a trained run as a GIF or MP4"),
-    "export": ("neuralq.apps.cli.export", "export", "write a run's network as ONNX, checked against its values"),
-    "solve": ("neuralq.apps.cli.exact", "solve", "compute the exact answer of an environment with a model"),
-    "chapter": ("neuralq.apps.cli.chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13"),
-    "baird": ("neuralq.apps.cli.demo", "baird", "predict divergence on Baird's star, then measure it"),
-    "lab": (
-        "neuralq.apps.cli.lab",
-        "lab",
-        "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page",
-    ),
-    "play": (
-        "neuralq.apps.cli.play",
-        "play",
-        "play backgammon against a trained agent, or tic-tac-toe, in the browser",
-    ),
-    "demo": ("neuralq.apps.cli.demo", "demo", "learn CartPole, predict a divergence, write a page about both"),
+    "train": _of("runs", "train", "train on a Gymnasium environment, or td-gammon, by TD(λ)", _LOOK),
+    "resume": _of("runs", "resume", "go on with a run that was stopped or killed", _LOOK),
+    "evaluate": _of("runs", "evaluate", "play greedy episodes with a trained run", _LOOK),
+    "report": _of("runs", "report", "write a run's report.html", _LOOK),
+    "compare": _of("compare", "compare", "table and plot of several runs or sweeps side by side", _LOOK),
+    "presets": _of("presets", "presets", "list the tuned settings per environment", _LOOK),
+    "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),
+    "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
+    "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),
+    "lab": _of("lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page", _KNOW),
+    "baird": _of("demo", "baird", "predict divergence on Baird's star, then measure it", _KNOW),
+    "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),
+    "chapter": _of("chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13", _EXACT),
+    "demo": _of("demo", "demo", "learn CartPole, predict a divergence, write a page about both", _PLAY),
+    "play": _of("play", "play", "play backgammon against a trained agent, or tic-tac-toe, in the browser", _PLAY),
+    "completion": _of("completion", "completion", "print a script that completes commands in your shell", _PLAY),
 }
 
 EXAMPLES = """examples:
@@ -74,9 +97,52 @@ def _show_warning(
     print(f"neuralq: warning: {message}", file=sys.stderr)
 
 
-def command_parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
+class _Asked(Exception):
+    """A command was asked for its parser, not to run."""
+
+
+_asking = contextvars.ContextVar("_asking", default=False)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """The parser of a command: options have hyphens, and λ is ``--lambda``, whichever way they are typed."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[argparse.Namespace, list[str]]:
+        """As argparse does; the parser itself is handed out where a command was asked for it."""
+        if _asking.get() and self.add_help:  # one without help only looks ahead
+            raise _Asked(self)
+        return super().parse_known_args([option_as_typed(token) for token in args or ()], namespace)
+
+
+def option_as_typed(token: str) -> str:
+    """An option as the help spells it; everything else is left alone.
+
+    Example:
+        >>> option_as_typed("--lambda_=0.5"), option_as_typed("--num_seeds"), option_as_typed("a_b")
+        ('--lambda=0.5', '--num-seeds', 'a_b')
+    """
+    if not token.startswith("--"):
+        return token
+    name, equals, value = token.partition("=")
+    return name.rstrip("_").replace("_", "-") + equals + value
+
+
+def parser_of(module: str, function: str) -> argparse.ArgumentParser:
+    """The parser of a command, which is asked for it before it does anything."""
+    token = _asking.set(True)
+    try:
+        getattr(importlib.import_module(module), function)([])
+    except _Asked as asked:
+        parser: argparse.ArgumentParser = asked.args[0]
+        return parser
+    finally:
+        _asking.reset(token)
+    raise AssertionError(f"{module}.{function} ran without reading its options")
+
+
+def command_parser(name: str, description: str, *examples: str) -> CommandParser:
     """The parser of one command: its examples stand below the options, and it takes ``--json``."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog=f"neuralq {name}",
         description=description,
         epilog="\n  ".join(["example:" if len(examples) == 1 else "examples:", *examples]),
@@ -86,20 +152,32 @@ def command_parser(name: str, description: str, *examples: str) -> argparse.Argu
     return parser
 
 
-def _top_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="neuralq",
-        description="Learn value functions beside the exact answer, and know before training what converges.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    from neuralq import __version__
+def _top_help() -> str:
+    """The commands, grouped by what they are for, and examples."""
+    lines = [
+        "usage: neuralq [-h] [--version] COMMAND ...",
+        "",
+        "Learn value functions beside the exact answer, and know before training what converges.",
+    ]
+    for group, members in itertools.groupby(COMMANDS.items(), key=lambda item: item[1].group):
+        lines += ["", f"{group}:", *(f"  {name:<11} {command.summary}" for name, command in members)]
+    return "\n".join([*lines, "", EXAMPLES])
 
-    parser.add_argument("--version", action="version", version=f"neuralq {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, (_, _, summary) in COMMANDS.items():
-        commands.add_parser(name, help=summary, add_help=False)
-    return parser
+
+def _top(first: str) -> int:
+    """What is answered where no command is named."""
+    if first in ("-h", "--help", "help"):
+        print(_top_help())
+        return 0
+    if first == "--version":
+        from neuralq import __version__
+
+        print(f"neuralq {__version__}")
+        return 0
+    close = difflib.get_close_matches(first, COMMANDS, 1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+    print(f"neuralq: there is no command {first!r}; {hint} (neuralq --help)", file=sys.stderr)
+    return 2
 
 
 @contextlib.contextmanager
@@ -119,12 +197,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments:
-        _top_parser().print_help(sys.stderr)
+        print(_top_help(), file=sys.stderr)
         return 2
     if arguments[0] not in COMMANDS:
-        _top_parser().parse_args(arguments)
-        return 2  # not reached: argparse has ended the process with help or an error
-    module, function, _ = COMMANDS[arguments[0]]
+        return _top(arguments[0])
+    module, function = COMMANDS[arguments[0]][:2]
     try:
         with _present_folder(), warnings.catch_warnings():
             command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)

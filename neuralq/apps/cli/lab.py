@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli import CommandParser, Failure, command_parser, print_result
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -37,7 +37,7 @@ COMMANDS = {
     ),
 }
 
-Parser = argparse.ArgumentParser
+Parser = CommandParser
 
 
 def lab(argv: list[str]) -> int:

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NoReturn, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
-from jsonargparse import ArgumentParser
 
 from neuralq.apps.cli import Failure
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LAYOUTS, LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import (
+    LAYOUTS,
+    LEARNERS,
+    NETWORKS,
+    body_to_dict,
+    config_from_dict,
+    config_to_dict,
+    fitted_value,
+)
 
-__all__ = ["TrainOptions", "hyphenated", "parse_train"]
+__all__ = ["TrainOptions", "hyphenated", "parse_train", "train_parser"]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
@@ -28,12 +36,11 @@ _EXAMPLES = """examples:
   neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
   neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
   neuralq train td-gammon --games 100000  (backgammon; has options of its own)
-  neuralq train my_package:MyEnv-v0 --rollout.lambda 0.8 --hidden 64,64
+  neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
 _WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "wandb", "print_config"}
-_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "dict": "a mapping"}
 
 
 @dataclass(frozen=True)
@@ -88,22 +95,46 @@ def _as_typed(text: str) -> str:
     )
 
 
-class _Parser(ArgumentParser):
-    """Answers wrong usage with one line instead of the list of all options."""
+def _reader(hint: Any) -> Callable[[str], Any]:
+    """What reads an option's text as the kind of value that its field holds."""
 
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise Failure(f"{_in_one_line(message)}; `neuralq train --help` lists the options", 2) from ex
+    def read(text: str) -> Any:
+        value: Any = text
+        if hint is not str:
+            with contextlib.suppress(yaml.YAMLError):
+                value = yaml.safe_load(text)
+            with contextlib.suppress(ValueError):  # YAML 1.1 takes 1e-5 for a word
+                value = float(text) if isinstance(value, str) else value
+        try:
+            return fitted_value("", value, hint, text)
+        except ValueError as error:
+            if str in get_args(hint):
+                return text
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read
 
 
-def _in_one_line(message: str) -> str:
-    key = re.match(r'Parser key "([\w.]+)":', message)
-    got = re.findall(r"(?:Got value|Given value): (.*)", message)
-    if key is None or not got:
-        return _as_typed(" ".join(message.split()))
-    kinds = dict.fromkeys(re.findall(r"<class '(\w+)'>", message.split("Given value")[0]))
-    expected = " or ".join(_WORDS.get(kind, kind) for kind in kinds if kind != "NoneType")
-    name = _as_typed(f"--{key[1]}")
-    return f"{name} must be {expected}, got {got[-1]}" if expected else f"{name}: cannot use {got[-1]}"
+def _refusal(message: str, name: str | None = None) -> Failure:
+    said = " ".join(message.split())
+    if name is not None:
+        said = f"{name} {said}" if said.startswith("must ") else f"{name}: {said}"
+    return Failure(f"{_as_typed(said)}; `neuralq train --help` lists the options", 2)
+
+
+def _parsed(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
+    """What was given, by name, settings of the learner as a mapping; wrong usage is one line, not all the options."""
+    try:
+        found, unknown = parser.parse_known_args(list(argv))
+    except argparse.ArgumentError as error:
+        raise _refusal(error.message, error.argument_name) from error
+    if unknown:
+        raise _refusal(f"unrecognized arguments: {' '.join(unknown)}")
+    given: dict[str, Any] = {}
+    for name, value in vars(found).items():
+        place, _, field = name.rpartition(".")
+        (given.setdefault(place, {}) if place else given)[field] = value
+    return given
 
 
 def _with_env_named(argv: Sequence[str]) -> list[str]:
@@ -185,41 +216,48 @@ def _add_fields(parser: Any, settings: type[Any], prefix: str, preset: dict[str,
             words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
             kind = next((k for k in (types[f.name], *get_args(types[f.name])) if k in words), str)
             text = f"{texts[f.name].rstrip('.')} (default: {'none' if default is None else default})".replace("%", "%%")
-            parser.add_argument(f"--{prefix}{f.name}", type=types[f.name], metavar=words[kind], help=text)
+            parser.add_argument(f"--{prefix}{f.name}", type=_reader(types[f.name]), metavar=words[kind], help=text)
 
 
-def _build(learner: str, preset: dict[str, Any]) -> ArgumentParser:
-    parser = _Parser(
+def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParser:
+    """The parser of a run by ``learner``; the preset's values stand in the help, and what is not given is left out."""
+    parser = argparse.ArgumentParser(
         prog="neuralq train",
         usage="neuralq train ENV [options]",
         description="Train on a Gymnasium environment by TD(λ). ENV is a registered id, or module:id for your own.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
-        print_config=None,
+        exit_on_error=False,
+        argument_default=argparse.SUPPRESS,
     )
     add = parser.add_argument
     add("--env", type=str, help=argparse.SUPPRESS)
-    add("--env_kwargs", type=dict, metavar="MAPPING", help="JSON or YAML mapping passed to gymnasium.make")
+    add("--env_kwargs", type=_reader(dict), metavar="MAPPING", help="JSON or YAML mapping passed to gymnasium.make")
     add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
     add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
     _add_fields(parser, RunConfig, "", preset)
     bodies = f"{', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: '{{class: MLP, hidden: [64]}}'"
-    add("--body", type=dict | str | None, metavar="NAME", help=f"network body: {bodies}")
+    add("--body", type=_reader(dict | str | None), metavar="NAME", help=f"network body: {bodies}")
     add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
-    add("--layer_norm", type=bool | None, metavar="{true,false}", help="layer normalisation in the network")
+    add("--layer_norm", type=_reader(bool | None), metavar="{true,false}", help="layer normalisation in the network")
     add("--activation", type=str, metavar="NAME", help="relu, tanh or leaky_relu")
     add("--config", type=str, metavar="FILE", help="YAML file of options, as --print_config writes it")
     add("--print_config", action="store_true", help="print the resulting configuration and exit")
     add("--run_dir", type=str, metavar="FOLDER", help="where the run goes (default: a folder under runs/)")
     add(
         "--preset",
-        type=bool,
+        type=_reader(bool),
         metavar="{true,false}",
         help="whether to start from the environment's preset (default: true)",
     )
-    add("--seeds", type=int, metavar="N", help="run N seeds, counted from --seed, in processes side by side")
-    add("--workers", type=int, metavar="N", help="how many seeds at a time (default: as many as there are cores)")
+    add("--seeds", type=_reader(int), metavar="N", help="run N seeds, counted from --seed, in processes side by side")
+    add(
+        "--workers",
+        type=_reader(int),
+        metavar="N",
+        help="how many seeds at a time (default: as many as there are cores)",
+    )
     add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
     add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
     add("--hook", type=str, metavar="module:name", help="function or class of your own that takes every row of metrics")
@@ -243,10 +281,12 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         preset = {name: value for name, value in preset.items() if name != "body"}
     has_preset = bool(preset)
     if {"-h", "--help"} & set(rest):
-        print(_as_typed(_build(known.learner, preset).format_help()))
+        print(_as_typed(train_parser(known.learner, preset).format_help()))
         return None
     _refuse_other_learners(rest, known.learner)
-    given = _build(known.learner, preset).parse_args(rest, defaults=False).as_dict()
+    # A run has one learner, so that λ needs no place.
+    rest = [re.sub(r"^--lambda_(?==|$)", f"--{known.learner}.lambda_", token) for token in rest]
+    given = _parsed(train_parser(known.learner, preset), rest)
     preset, notes = cut_to_budget(preset, {**file, **given, "learner": known.learner})
     options = TrainOptions(
         run_dir=given.pop("run_dir", None),

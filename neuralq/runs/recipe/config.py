@@ -14,7 +14,7 @@ from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import MLP, NAMED_BODIES, Body, Conv, Custom
 from neuralq.runs.recipe.games import is_screen
 
-__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict"]
+__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict", "fitted_value"]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
@@ -259,10 +259,25 @@ def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:
         raise ValueError(f"{place} must be a mapping, got {given!r}")
     _refuse_unknown(place, given, known)
     hints = get_type_hints(known)
-    return {name: _fit(f"{place}.{name}".lstrip("."), value, hints[name]) for name, value in given.items()}
+    return {name: fitted_value(f"{place}.{name}".lstrip("."), value, hints[name]) for name, value in given.items()}
 
 
-def _fit(name: str, value: Any, hint: Any) -> Any:
+def fitted_value(name: str, value: Any, hint: Any, given: str | None = None) -> Any:
+    """``value`` as the kind that ``hint`` asks for: whole numbers become floats where those are wanted, lists tuples.
+
+    Args:
+        name: how the value is called.
+        value: what it is.
+        hint: the type of its field.
+        given: how it was written, where that is not how Python writes it.
+
+    Raises:
+        ValueError: it is of another kind.
+
+    Example:
+        >>> fitted_value("gamma", 1, float), fitted_value("num_atoms", 8.0, int | None)
+        (1.0, 8)
+    """
     kinds = [get_origin(kind) or kind for kind in (get_args(hint) if isinstance(hint, UnionType) else (hint,))]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     for kind in kinds:
@@ -271,12 +286,12 @@ def _fit(name: str, value: Any, hint: Any) -> Any:
         if kind is int and is_number and float(value).is_integer():
             return int(value)
         if kind is tuple and isinstance(value, list | tuple):
-            return tuple(_fit(f"{name}[{i}]", entry, get_args(hint)[0]) for i, entry in enumerate(value))
+            return tuple(fitted_value(f"{name}[{i}]", entry, get_args(hint)[0]) for i, entry in enumerate(value))
         if kind not in (int, float, tuple) and isinstance(value, kind):
             return value
     words = [_WORDS.get(kind, f"a {kind.__name__}") for kind in kinds if kind is not NoneType]
     words = ["a list" if word == "a tuple" else word for word in words]
-    raise ValueError(f"{name} must be {' or '.join(words)}, got {value!r}")
+    raise ValueError(f"{name} must be {' or '.join(words)}, got {given or repr(value)}".lstrip())
 
 
 def _refuse_unknown(where: str, given: Mapping[str, Any], known: type) -> None:
