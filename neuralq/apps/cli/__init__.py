@@ -107,7 +107,7 @@ _asking = contextvars.ContextVar("_asking", default=False)
 class CommandParser(argparse.ArgumentParser):
     """The parser of a command: options have hyphens, and λ is ``--lambda``, whichever way they are typed."""
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[argparse.Namespace, list[str]]:
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; the parser itself is handed out where a command was asked for it."""
         if _asking.get() and self.add_help:  # one without help only looks ahead
             raise _Asked(self)
