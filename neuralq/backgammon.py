@@ -1,31 +1,4 @@
 """TD-Gammon by a short name: `neuralq.systems.backgammon`, for ``from neuralq.backgammon import load_agent``."""
 
-from neuralq.systems.backgammon import (
-    BackgammonAgent,
-    Chances,
-    MatchResult,
-    RankedTurn,
-    SelfPlay,
-    SelfPlaySettings,
-    TdGammonConfig,
-    ValueNetwork,
-    load_agent,
-    play_match,
-    resume_games,
-    train_games,
-)
-
-__all__ = [
-    "BackgammonAgent",
-    "Chances",
-    "MatchResult",
-    "RankedTurn",
-    "SelfPlay",
-    "SelfPlaySettings",
-    "TdGammonConfig",
-    "ValueNetwork",
-    "load_agent",
-    "play_match",
-    "resume_games",
-    "train_games",
-]
+from neuralq.systems.backgammon import *  # noqa: F403 - all of its public names, whichever they are
+from neuralq.systems.backgammon import __all__ as __all__
