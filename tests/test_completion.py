@@ -71,7 +71,7 @@ def test_zsh_takes_the_script_and_knows_every_command(tmp_path: Path, capsys: py
     program = f"fpath=({tmp_path} $fpath); autoload -U compinit; compinit -u -d {tmp_path}/dump; print $_comps[neuralq]"
     ended = subprocess.run([needs("zsh"), "-f", "-c", program], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == "_neuralq"
-    assert all(f'"{name}:' in text or f"'{name}:" in text or f'{name})' in text for name in COMMANDS)
+    assert all(f'"{name}:' in text or f"'{name}:" in text or f"{name})" in text for name in COMMANDS)
     subprocess.run([needs("zsh"), "-n", str(tmp_path / "_neuralq")], check=True)
 
 

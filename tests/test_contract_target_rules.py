@@ -36,20 +36,19 @@ from torch import Tensor
 
 from neuralq import RunConfig, Transition
 from neuralq.learners import DistributionalLearner, DQRCLearner, ReplayLearner, ReplaySettings
+from neuralq.learners.replay.distributions.record import distributions
 from neuralq.q import MLP
+from neuralq.rules import target_rules
+from neuralq.runs.recipe import build
 
 
 def listed() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """All target rules and all distributions: the one place here that knows where the library lists them."""
-    from neuralq.learners.replay_settings import DISTRIBUTIONS, TARGET_RULES
-
-    return tuple(TARGET_RULES), tuple(DISTRIBUTIONS)
+    return tuple(target_rules()), tuple(distributions())
 
 
 def built(config: RunConfig) -> Any:
     """The learner of a run, and the name of its engine: the one place here that knows who builds them."""
-    from neuralq.recipes import build
-
     with pytest.MonkeyPatch.context() as patch:  # what it finds is tested elsewhere, and takes most of the time here
         patch.setattr(build, "is_resumable", lambda *_: None)
         session = build.build_session(config)
