@@ -29,8 +29,8 @@ from neuralq.tabular import (
 from neuralq.tabular.engine import Learner, new_table
 from neuralq.tabular.kernels.acting import FORGET, new_log, new_walk
 from neuralq.tabular.kernels.sweeping import FULL, HEAP_SIZE, _offer, _pop, new_memory
-from neuralq.tabular.planning import DynaLearner, SweepingLearner
-from neuralq.tabular.policies import acting_code, step_code
+from neuralq.tabular.planning import dyna_learner, sweeping_learner
+from neuralq.tabular.policies import step_code
 
 WALLS = {(1, 2), (2, 2), (3, 2), (4, 5), (0, 7), (1, 7), (2, 7)}
 ROW_3 = {(3, x) for x in range(8)}  # the wall of the blocking maze, open at the right end
@@ -206,18 +206,20 @@ def backups_until_optimal(learner: Learner, seed: int, mdp: FiniteMDP) -> int:
     for _ in range(4000):
         learner.run(model.arrays, walk, log, 0.95, 20)
         if greedy_steps(learner.table.q, mdp) == 14:
-            return int(learner.num_backups)  # type: ignore[attr-defined]
+            assert learner.backups is not None
+            return int(learner.backups[0])
     return 10**9
 
 
 def test_prioritized_sweeping_needs_fewer_backups_than_dyna() -> None:
-    mdp, policy = dyna_maze(), acting_code(EpsilonGreedy(0.1))
+    mdp, policy = dyna_maze(), EpsilonGreedy(0.1)
     dyna, swept = [], []
     for seed in range(9):
         table, _ = new_table(mdp, RunOptions())
-        dyna.append(backups_until_optimal(DynaLearner(table, policy, step_code(1.0, 1), 5, 0.0, False), seed, mdp))
+        dyna.append(backups_until_optimal(dyna_learner(table, policy, step_code(1.0, 1), 5, 0.0), seed, mdp))
         table, _ = new_table(mdp, RunOptions(initial_q=1.0))
-        learner = SweepingLearner(table, policy, step_code(1.0, 1), FULL, 1, 5, 1e-4, bored=1, optimistic=1.0)
+        memory = new_memory(table.q.shape, 1)
+        learner = sweeping_learner(table, policy, step_code(1.0, 1), memory, FULL, 5, 1e-4, bored=1, optimistic=1.0)
         swept.append(backups_until_optimal(learner, seed, mdp))
     assert np.median(dyna) >= 3 * np.median(swept) and max(swept) < 10**9
 
@@ -227,10 +229,10 @@ def test_an_empty_queue_leaves_no_error_and_the_fixed_point_is_that_of_value_ite
     mdp = FiniteMDP.garnet(6, 2, 3, seed=seed)
     table, ready = new_table(mdp, RunOptions())
     threshold = 1e-9
-    learner = SweepingLearner(table, acting_code("random"), step_code(1.0, 1), FULL, 3, 10_000, threshold)
+    memory = new_memory(table.q.shape, 3)
+    learner = sweeping_learner(table, "random", step_code(1.0, 1), memory, FULL, 10_000, threshold)
     walk, options = new_walk(seed), new_log(0, FORGET)
     learner.run(ready.arrays, walk, options, 0.8, 3000)  # type: ignore[union-attr]
-    memory = learner._memory
     assert memory.counters[HEAP_SIZE] == 0
     p = np.zeros((2, 6, 6))
     for s in range(6):
@@ -246,7 +248,7 @@ def test_an_empty_queue_leaves_no_error_and_the_fixed_point_is_that_of_value_ite
 
 
 def test_the_queue_gives_the_largest_first_also_after_changes() -> None:
-    rng, memory, threshold = np.random.default_rng(0), new_memory(1, 40, 1), 0.1
+    rng, memory, threshold = np.random.default_rng(0), new_memory((1, 40), 1), 0.1
     held: dict[int, float] = {}
     popped = 0
     for _ in range(600):

@@ -1,4 +1,16 @@
-"""Every tabular learner of Mitchell's chapter 13 in compiled loops, on a model or on a Gymnasium environment."""
+"""Every tabular learner of Mitchell's chapter 13 in compiled loops, on a model or on a Gymnasium environment.
+
+Arguments with one meaning in all of them:
+
+* ``source``: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower);
+* ``num_steps``: transitions of the source to learn from; ``gamma``: γ in [0, 1];
+* ``policy``: how to act, a setting or its name; a replayed expected Sarsa takes its expectation, nothing else does;
+* ``step_size``: α by the updates that a pair has had, real or imagined, counted from 0 in every call;
+* ``seed``: of the random stream; ``options``: what to start from and what to record.
+
+What learns from recorded transitions (`apply`, …) takes ``q``, the values to start from, which it does not change,
+``[S, A]`` with NaN (or −∞) where an action is illegal; and ``experience``, whose rows carry their own discounts.
+"""
 
 from neuralq.tabular.average import r_learning
 from neuralq.tabular.control import apply, double_q, expected_sarsa, q_learning, sarsa

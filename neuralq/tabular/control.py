@@ -1,15 +1,30 @@
-"""The one-step learners by name: each builds a table and a learner, and runs it."""
+"""The one-step learners by name: Q-learning, Sarsa, expected Sarsa and double Q-learning."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice
-from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
-from neuralq.tabular.kernels.acting import Table
+from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import FORGET, SARSA, Log, Table, Walk
+from neuralq.tabular.kernels.one_step import RULES, run_one_step
+from neuralq.tabular.kernels.q_learning import run_q_learning
 from neuralq.tabular.kernels.random_numbers import Seed
-from neuralq.tabular.onestep import RULES, OneStep
-from neuralq.tabular.policies import UPPER_CONFIDENCE, PolicyLike, StepSizeLike, acting_code, step_code
+from neuralq.tabular.model import ModelArrays
+from neuralq.tabular.policies import (
+    EPSILON_GREEDY,
+    RANDOM,
+    ActingCode,
+    PolicyLike,
+    StepCode,
+    StepSizeLike,
+    acting_code,
+    check_expectation,
+    step_code,
+)
 from neuralq.tabular.results import Experience, Learned
 
 __all__ = ["apply", "double_q", "expected_sarsa", "q_learning", "sarsa"]
@@ -30,15 +45,6 @@ def q_learning(
     With ``step_size="deterministic"`` (α = 1) this is Table 13.1 of Mitchell: the action is chosen after the update,
     and episodes restart from the model's start distribution.
 
-    Args:
-        source: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower).
-        num_steps: transitions, one update each.
-        gamma: γ in [0, 1].
-        policy: how to act, a setting or its name.
-        step_size: α by visits of the pair.
-        seed: of the random stream.
-        options: what to start from and what to record.
-
     Raises:
         ValueError: an argument out of range.
 
@@ -51,7 +57,7 @@ def q_learning(
         >>> learned.q.tolist(), int(learned.visits.sum())
         ([[90.0], [100.0]], 100)
     """
-    return _learn_one_step("q-learning", source, num_steps, gamma, policy, step_size, seed, options)
+    return _learn("q-learning", source, num_steps, gamma, policy, step_size, seed, options)
 
 
 def sarsa(
@@ -68,15 +74,6 @@ def sarsa(
 
     a' is drawn before the update and taken next.
 
-    Args:
-        source: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower).
-        num_steps: transitions, one update each.
-        gamma: γ in [0, 1].
-        policy: how to act, a setting or its name.
-        step_size: α by visits of the pair.
-        seed: of the random stream.
-        options: what to start from and what to record.
-
     Raises:
         ValueError: an argument out of range.
 
@@ -88,7 +85,7 @@ def sarsa(
         >>> sarsa(mdp, 100, gamma=0.9, step_size=1.0).q.tolist()
         [[90.0], [100.0]]
     """
-    return _learn_one_step("sarsa", source, num_steps, gamma, policy, step_size, seed, options)
+    return _learn("sarsa", source, num_steps, gamma, policy, step_size, seed, options)
 
 
 def expected_sarsa(
@@ -105,15 +102,6 @@ def expected_sarsa(
 
     The policy must be a distribution, so confidence bounds are refused.
 
-    Args:
-        source: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower).
-        num_steps: transitions, one update each.
-        gamma: γ in [0, 1].
-        policy: how to act, a setting or its name.
-        step_size: α by visits of the pair.
-        seed: of the random stream.
-        options: what to start from and what to record.
-
     Raises:
         ValueError: an argument out of range.
 
@@ -125,7 +113,7 @@ def expected_sarsa(
         >>> expected_sarsa(mdp, 100, gamma=0.9, policy="random", step_size=1.0).q.tolist()
         [[90.0], [100.0]]
     """
-    return _learn_one_step("expected-sarsa", source, num_steps, gamma, policy, step_size, seed, options)
+    return _learn("expected-sarsa", source, num_steps, gamma, policy, step_size, seed, options)
 
 
 def double_q(
@@ -142,15 +130,6 @@ def double_q(
 
     A fair coin decides which table learns; the agent acts on their mean, which is what is returned.
 
-    Args:
-        source: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower).
-        num_steps: transitions, one update each.
-        gamma: γ in [0, 1].
-        policy: how to act, a setting or its name.
-        step_size: α by visits of the pair.
-        seed: of the random stream.
-        options: what to start from and what to record.
-
     Raises:
         ValueError: an argument out of range.
 
@@ -162,7 +141,7 @@ def double_q(
         >>> double_q(mdp, 100, gamma=0.9, step_size=1.0).q.tolist()
         [[90.0], [100.0]]
     """
-    return _learn_one_step("double-q", source, num_steps, gamma, policy, step_size, seed, options)
+    return _learn("double-q", source, num_steps, gamma, policy, step_size, seed, options)
 
 
 def apply(
@@ -177,11 +156,7 @@ def apply(
     """The same update on recorded transitions, in their order: learning from stored experience.
 
     Args:
-        q: values to start from, ``[S, A]``, NaN (or −∞) where illegal; not changed.
-        experience: transitions, which carry their own discounts.
         rule: "q-learning", "sarsa", "expected-sarsa" or "double-q".
-        step_size: α by visits of the pair, counted from 0.
-        policy: whose expectation expected Sarsa takes; without meaning for the other rules.
         seed: of double Q-learning's coin.
 
     Raises:
@@ -195,22 +170,37 @@ def apply(
         [[0.0], [100.0]]
     """
     check_choice("rule", rule, RULES)
-    table = table_from(q)
-    learner = _one_step(rule, table, policy, step_size, len(experience))
-    return replay(learner, experience, seed)
+    return replay(_learner(rule, table_from(q), policy, step_size, len(experience)), experience, seed)
 
 
-def _learn_one_step(
-    rule: str, source: Source, num_steps: int, gamma: float, policy: PolicyLike, step_size: StepSizeLike, seed: Seed,
+def _learn(
+    rule: str,
+    source: Source,
+    num_steps: int,
+    gamma: float,
+    policy: PolicyLike,
+    step_size: StepSizeLike,
+    seed: Seed,
     options: RunOptions,
-) -> Learned:  # fmt: skip
+) -> Learned:
     table, ready = new_table(source, options)
-    return learn(_one_step(rule, table, policy, step_size, num_steps), ready, num_steps, gamma, seed, options)
+    return learn(_learner(rule, table, policy, step_size, num_steps), ready, num_steps, gamma, seed, options)
 
 
-def _one_step(rule: str, table: Table, policy: PolicyLike, step_size: StepSizeLike, num_steps: int) -> OneStep:
+def _learner(rule: str, table: Table, policy: PolicyLike, step_size: StepSizeLike, num_steps: int) -> Learner:
     acting = acting_code(policy)
-    if rule == "expected-sarsa" and acting.kind == UPPER_CONFIDENCE:
-        raise ValueError("expected Sarsa needs the policy's probabilities, and confidence bounds have none; "
-                         'use "epsilon-greedy", "softmax", "k-to-the-q" or "random"')  # fmt: skip
-    return OneStep(table, acting, step_code(step_size, num_steps), rule)
+    check_expectation(rule, acting)
+    halves = np.stack([table.q, table.q]) if rule == "double-q" else np.zeros((0, 0, 0))
+    arguments = (step_code(step_size, num_steps), RULES.index(rule), halves)
+    plain = rule == "q-learning" and acting.kind in (EPSILON_GREEDY, RANDOM)
+    return Learner(_q_learning if plain else run_one_step, table, acting, arguments, rule == RULES[SARSA])
+
+
+def _q_learning(
+    model: ModelArrays, policy: ActingCode, table: Table, walk: Walk, log: Log, step_size: StepCode, *rest: Any
+) -> None:
+    """The general loop, or the fast one where nothing is recorded, replayed or hidden."""
+    if log.mode == FORGET and model.observe.size == 0:
+        run_q_learning(model, policy, table, walk, step_size, *rest[-2:])
+    else:
+        run_one_step(model, policy, table, walk, log, step_size, *rest)

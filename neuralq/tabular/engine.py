@@ -7,8 +7,9 @@ taken in Python and handed to the same kernel as a stored transition, so both en
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -38,7 +39,7 @@ from neuralq.tabular.model import RESTARTS, Model, ModelArrays, compile_model, e
 from neuralq.tabular.policies import ActingCode
 from neuralq.tabular.results import Curve, Experience, Learned, masked
 
-__all__ = ["Learner", "RunOptions", "learn", "new_table", "replay", "table_from"]
+__all__ = ["Learner", "RunOptions", "learn", "log_of", "new_table", "replay", "table_from"]
 
 Source = FiniteMDP | Model | gymnasium.Env[Any, Any]
 """What can be learned on: a model, the same compiled once for many runs, or an environment with finite spaces."""
@@ -83,16 +84,29 @@ class RunOptions:
             raise ValueError("exact_q is used for the curve; set record_every too")
 
 
-class Learner(Protocol):
-    """What the engine asks of a tabular learner."""
+@dataclass(frozen=True)
+class Learner:
+    """A loop and what it changes: the whole of a tabular learner.
 
+    Args:
+        loop: of `neuralq.tabular.kernels`.
+        table: what is learned.
+        policy: how to act.
+        arguments: of the loop, from the step size to γ.
+        on_policy: whether the next action is chosen before the update.
+        backups: where all updates are counted, if they are not one for each transition.
+    """
+
+    loop: Callable[..., None]
     table: Table
     policy: ActingCode
-    on_policy: bool
+    arguments: tuple[Any, ...]
+    on_policy: bool = False
+    backups: NDArray[np.int64] | None = None
 
-    def run(self, model: ModelArrays, walk: Walk, log: Log, gamma: float, num_steps: int) -> Any:
+    def run(self, model: ModelArrays, walk: Walk, log: Log, gamma: float, num_steps: int) -> None:
         """Consume ``num_steps`` transitions, from the model or from the log."""
-        ...
+        self.loop(model, self.policy, self.table, walk, log, *self.arguments, gamma, num_steps)
 
 
 def new_table(source: Source, options: RunOptions) -> tuple[Table, Source]:
@@ -219,9 +233,7 @@ def replay(learner: Learner, experience: Experience, seed: Seed = 0) -> Learned:
     if learner.on_policy and (lacking.size or beyond.size):
         row = int(lacking[0] if lacking.size else beyond[0])
         raise ValueError(f"row {row} bootstraps from the next action, but a_t is {experience.next_actions[row]} there")
-    e = experience
-    log = Log(REPLAY, 0, e.s_tm1, e.a_tm1, e.r_t, e.discount_t, e.s_t, e.next_actions, e.last_t)
-    walk = new_walk(seed)
+    log, walk, e = log_of(experience), new_walk(seed), experience
     learner.run(empty_arrays(), walk, log, 0.0, 0)
     began = time.thread_time()
     learner.run(empty_arrays(), walk, log, 0.0, len(e))
@@ -230,18 +242,28 @@ def replay(learner: Learner, experience: Experience, seed: Seed = 0) -> Learned:
     return _result(learner, walk, log, _Recorder(learner.table.q, RunOptions()), len(e), seconds)
 
 
+def log_of(experience: Experience) -> Log:
+    """Recorded transitions as kernels replay them.
+
+    Example:
+        >>> log_of(Experience([0], [0], [1.0], [0.0], [0], [True])).a_t.tolist()
+        [-1]
+    """
+    e = experience
+    return Log(REPLAY, 0, e.s_tm1, e.a_tm1, e.r_t, e.discount_t, e.s_t, e.next_actions, e.last_t)
+
+
 def _result(learner: Learner, walk: Walk, log: Log, recorder: _Recorder, num_steps: int, seconds: float) -> Learned:
     experience = None
     lengths = np.zeros(0, dtype=np.int64)
     if log.mode == RECORD:
         experience = Experience(log.s_tm1, log.a_tm1, log.r_t, log.discount_t, log.s_t, log.last_t, log.a_t)
         lengths = np.diff(np.flatnonzero(log.last_t), prepend=-1)
-    table = learner.table
+    table, backups = learner.table, learner.backups
     return Learned(
         q=masked(table.q), visits=table.visits.copy(), num_steps=num_steps, episode_lengths=lengths,
-        num_episodes=int(walk.counters[EPISODES]), num_backups=int(getattr(learner, "num_backups", num_steps)),
-        average_reward=float(getattr(learner, "average_reward", np.nan)), curve=recorder.curve(),
-        experience=experience, cpu_seconds=seconds,
+        num_episodes=int(walk.counters[EPISODES]), num_backups=num_steps if backups is None else int(backups[0]),
+        average_reward=np.nan, curve=recorder.curve(), experience=experience, cpu_seconds=seconds,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ __all__ = [
     "UpperConfidence",
     "Visits",
     "acting_code",
+    "check_expectation",
     "step_code",
 ]
 
@@ -71,7 +72,6 @@ class EpsilonGreedy:
     ties: str = "random"
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         check_fraction("epsilon", self.epsilon, "0 is greedy, 1 is uniform")
         check_choice("ties", self.ties, TIES)
         if self.final is not None:
@@ -97,7 +97,6 @@ class KToTheQ:
     growth: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         check_positive("k", self.k)
         if not (math.isfinite(self.growth) and self.growth >= 0):
             raise ValueError(f"growth must be a finite number of at least 0, got {self.growth}")
@@ -122,7 +121,6 @@ class Softmax:
     num_steps: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         check_positive("temperature", self.temperature)
         if self.final is not None:
             check_positive("final", self.final)
@@ -147,7 +145,6 @@ class UpperConfidence:
     ties: str = "random"
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         if not (math.isfinite(self.c) and self.c >= 0):
             raise ValueError(f"c must be a finite number of at least 0, got {self.c}")
         check_choice("ties", self.ties, TIES)
@@ -196,6 +193,22 @@ def acting_code(policy: PolicyLike) -> ActingCode:
     return policy.code()
 
 
+def check_expectation(rule: str, policy: ActingCode) -> None:
+    """Refuse expected Sarsa for a policy that is no distribution.
+
+    Raises:
+        ValueError: confidence bounds.
+
+    Example:
+        >>> check_expectation("expected-sarsa", acting_code("softmax"))
+    """
+    if rule == "expected-sarsa" and policy.kind == UPPER_CONFIDENCE:
+        raise ValueError(
+            "expected Sarsa needs the policy's probabilities, and confidence bounds have none; "
+            'use "epsilon-greedy", "softmax", "k-to-the-q" or "random"'
+        )
+
+
 @dataclass(frozen=True)
 class Visits:
     """α_n = 1 / (1 + n), n counting the visits of the pair up to this update, so the first is 1/2 (Mitchell 13.11)."""
@@ -212,7 +225,6 @@ class Power:
     omega: float = 0.8
 
     def __post_init__(self) -> None:
-        """Refuse values outside their range."""
         check_positive("omega", self.omega)
 
 

@@ -1,172 +1,26 @@
 """Prediction: TD(λ) for state values, on-line, once per episode, or over a whole batch; and true online TD(λ).
 
-    δ_t = r_t + discount_t V(s_t) − V(s_tm1),    V(x) ← V(x) + α δ_t z(x)                       (Sutton 1988, eq. 4)
-
-The trace z decays by λ · (discount into s_tm1) and grows by 1 at s_tm1 (accumulating) or is set to 1 (replacing). True
-online TD(λ) has a dutch trace and one more term, and equals the on-line λ-return step for step. A batch is presented
-again and again, its increments added at the end of each presentation, until nothing moves: TD(0) then gives the values
-of the most likely Markov process (certainty equivalence), TD(1) the least squares fit to the returns seen.
-
-A process to predict is an MDP with one action in every state; `under_policy` makes one of any model and policy.
+The formulas are in `neuralq.tabular.kernels.td`. A process to predict is an MDP with one action in every state;
+`under_policy` makes one of any model and policy.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
-from neuralq.jit import lean_kernel
 from neuralq.mdp import FiniteMDP, Outcomes
-from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
-from neuralq.tabular.kernels.acting import REPLAY, Log, Table, Walk, new_walk, next_step, step_length
+from neuralq.tabular.engine import Learner, RunOptions, Source, learn, log_of, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import Table, new_walk
 from neuralq.tabular.kernels.random_numbers import Seed
-from neuralq.tabular.model import ModelArrays, complete_outcomes, empty_arrays
-from neuralq.tabular.policies import CONSTANT, ActingCode, StepCode, StepSizeLike, acting_code, step_code
+from neuralq.tabular.kernels.td import KINDS, UPDATES, run_td
+from neuralq.tabular.kernels.traces import new_traces
+from neuralq.tabular.model import complete_outcomes, empty_arrays
+from neuralq.tabular.policies import CONSTANT, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
-from neuralq.tabular.traces import Traces, new_traces
 
-__all__ = ["batch_td", "predict", "run_td", "td_lambda", "under_policy"]
-
-KINDS = ("accumulating", "replacing", "true-online")
-UPDATES = ("step", "episode", "batch")
-REPLACING, TRUE_ONLINE = 1, 2
-EVERY_STEP, EVERY_EPISODE = 0, 1
-
-_SMALLEST = 1e-14
-_ZERO: Any = np.uint64(0)
-_ONE: Any = np.uint64(1)
-
-
-@lean_kernel
-def run_td(
-    model: ModelArrays,
-    policy: ActingCode,
-    table: Table,
-    walk: Walk,
-    log: Log,
-    step_size: StepCode,
-    traces: Traces,
-    pending: NDArray[np.float64],
-    v_old: NDArray[np.float64],
-    kind: int,
-    update: int,
-    lambda_: float,
-    gamma: float,
-    num_steps: int,
-) -> None:
-    """``num_steps`` transitions, each followed by its increments.
-
-    Args:
-        model: where transitions come from, unless ``log`` replays.
-        policy: how to act.
-        table: values ``[S, 1]`` and visits, changed in place.
-        walk: where the agent is, changed in place.
-        log: what to record, or to replay.
-        step_size: α by visits of the state.
-        traces: changed in place.
-        pending: increments not yet added, ``[S]``.
-        v_old: V(s_tm1) before the last update, ``[1]``.
-        kind: index in ``KINDS``.
-        update: index in ``UPDATES``.
-        lambda_: λ.
-        gamma: γ.
-        num_steps: how many.
-    """
-    v, visits, z = table.q, table.visits, traces.z
-    for i in range(num_steps):
-        s, _a, r_t, discount_t, s_t, _a_t, last_t = next_step(model, policy, table, walk, log, i, gamma, False)
-        n = visits[s, _ZERO] + 1
-        visits[s, _ZERO] = n
-        alpha = step_length(step_size, n)
-        traces.alpha[s] = alpha
-        v_tm1 = v[s, _ZERO]
-        v_t = v[s_t, _ZERO] if discount_t != 0.0 else 0.0
-        delta = r_t + discount_t * v_t - v_tm1
-        change = v_tm1 - v_old[_ZERO] if kind == TRUE_ONLINE else 0.0
-        decay = traces.decay[_ZERO]
-        kept, own = _ZERO, 0.0
-        for k in range(traces.num_active[_ZERO]):
-            x = traces.active[k]
-            z[x] *= decay
-            if x == s:
-                own = z[x]
-            elif z[x] > _SMALLEST:
-                traces.active[kept] = x
-                kept += _ONE
-            else:
-                z[x] = 0.0
-        if kind == TRUE_ONLINE:
-            z[s] = own + (1.0 - alpha * own)
-        else:
-            z[s] = 1.0 if kind == REPLACING else own + 1.0
-        traces.active[kept] = s
-        kept += _ONE
-        for k in range(kept):
-            x = traces.active[k]
-            step = traces.alpha[x] * (delta + change) * z[x]
-            if x == s:
-                step -= alpha * change
-            if update == EVERY_STEP:
-                v[x, _ZERO] += step
-            else:
-                pending[x] += step
-        traces.num_active[_ZERO] = kept
-        traces.decay[_ZERO] = discount_t * lambda_
-        v_old[_ZERO] = v_t
-        if last_t or discount_t * lambda_ == 0.0:
-            for k in range(kept):
-                z[traces.active[k]] = 0.0
-            traces.num_active[_ZERO] = _ZERO
-        if last_t:
-            v_old[_ZERO] = 0.0
-            if update == EVERY_EPISODE:
-                for x in range(_ZERO, np.uint64(pending.size)):
-                    v[x, _ZERO] += pending[x]
-                    pending[x] = 0.0
-
-
-class TDLearner:
-    """The learner that `run_td` runs.
-
-    Args:
-        table: values ``[S, 1]`` and visits, changed in place.
-        step_size: α by visits of the state.
-        lambda_: λ in [0, 1].
-        kind: "accumulating", "replacing" or "true-online".
-        update: "step", "episode" or "batch" (increments are only collected).
-
-    Raises:
-        ValueError: an argument out of range, more than one action, or true online TD(λ) with anything but a constant
-            step size at every step.
-    """
-
-    def __init__(self, table: Table, step_size: StepCode, lambda_: float, kind: str, update: str) -> None:
-        check_choice("kind", kind, KINDS)
-        check_choice("update", update, UPDATES)
-        check_fraction("lambda_", lambda_, "for Monte Carlo use lambda_=1")
-        if table.q.shape[1] != 1:
-            raise ValueError(
-                f"prediction needs a process with one action, got {table.q.shape[1]}; see tabular.under_policy(mdp, pi)"
-            )
-        if kind == "true-online" and (step_size.kind != CONSTANT or step_size.listed.size or update != "step"):
-            raise ValueError('true online TD(λ) is derived for a constant step size and update="step"')
-        self.table = table
-        self.policy = acting_code("random")
-        self.on_policy = False
-        self.pending = np.zeros(len(table.q))
-        self._step_size = step_size
-        self._traces, self._v_old = new_traces(len(table.q)), np.zeros(1)
-        self._rest = (KINDS.index(kind), UPDATES.index(update), float(lambda_))
-
-    def run(self, model: ModelArrays, walk: Walk, log: Log, gamma: float, num_steps: int) -> Any:
-        """``num_steps`` transitions from the model, or from the log if it replays."""
-        run_td(
-            model, self.policy, self.table, walk, log, self._step_size, self._traces, self.pending, self._v_old,
-            *self._rest, gamma, num_steps,
-        )  # fmt: skip
+__all__ = ["batch_td", "predict", "td_lambda", "under_policy"]
 
 
 def td_lambda(
@@ -185,14 +39,10 @@ def td_lambda(
 
     Args:
         source: an MDP, compiled model or environment with one action; see `under_policy`.
-        num_steps: transitions.
-        gamma: γ in [0, 1].
         lambda_: λ in [0, 1].
         kind: "accumulating", "replacing" or "true-online".
         update: whether increments are added at every "step" or at the end of each "episode".
         step_size: α by visits of the state.
-        seed: of the random stream.
-        options: what to start from and what to record.
 
     Raises:
         ValueError: an argument out of range, or more than one action.
@@ -206,7 +56,7 @@ def td_lambda(
     """
     check_choice("update", update, UPDATES[:2])
     table, ready = new_table(source, options)
-    learner = TDLearner(table, step_code(step_size, num_steps), lambda_, kind, update)
+    learner = _learner(table, step_code(step_size, num_steps), lambda_, kind, update)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -223,7 +73,6 @@ def predict(
 
     Args:
         v: values to start from, ``[S]``; not changed.
-        experience: transitions, which carry their own discounts.
         lambda_: λ in [0, 1].
         kind: "accumulating", "replacing" or "true-online".
         update: whether increments are added at every "step" or at the end of each "episode".
@@ -239,8 +88,7 @@ def predict(
     """
     check_choice("update", update, UPDATES[:2])
     code = step_code(step_size, len(experience))
-    learner = TDLearner(table_from(np.asarray(v, dtype=np.float64)[:, None]), code, lambda_, kind, update)
-    return replay(learner, _one_action(experience))
+    return replay(_learner(table_from(_column(v)), code, lambda_, kind, update), _one_action(experience))
 
 
 def batch_td(
@@ -279,18 +127,18 @@ def batch_td(
     check_positive("step_size", step_size)
     check_positive("tol", tol)
     check_whole("max_presentations", max_presentations)
-    table = table_from(np.asarray(v, dtype=np.float64)[:, None])
-    learner = TDLearner(table, step_code(step_size, 1), lambda_, "accumulating", "batch")
-    replay(learner, _one_action(experience))  # checks the batch; its increments are those of the first presentation
-    e, walk, nothing = _one_action(experience), new_walk(0), empty_arrays()
-    log = Log(REPLAY, 0, e.s_tm1, e.a_tm1, e.r_t, e.discount_t, e.s_t, e.next_actions, e.last_t)
+    table, batch = table_from(_column(v)), _one_action(experience)
+    pending = np.zeros(len(table.q))
+    learner = _learner(table, step_code(step_size, 1), lambda_, "accumulating", "batch", pending)
+    replay(learner, batch)  # checks the batch; its increments are those of the first presentation
+    walk, nothing, log = new_walk(0), empty_arrays(), log_of(batch)
     for _ in range(max_presentations):
-        table.q[:, 0] += learner.pending
-        moved = float(np.max(np.abs(learner.pending)))
-        learner.pending[:] = 0
+        table.q[:, 0] += pending
+        moved = float(np.max(np.abs(pending)))
+        pending[:] = 0
         if moved <= tol * step_size:
             return table.q[:, 0].copy(), True
-        learner.run(nothing, walk, log, 0.0, len(e))
+        learner.run(nothing, walk, log, 0.0, len(batch))
     return table.q[:, 0].copy(), False
 
 
@@ -339,3 +187,32 @@ def under_policy(mdp: FiniteMDP, policy: ArrayLike) -> FiniteMDP:
 def _one_action(experience: Experience) -> Experience:
     e = experience
     return Experience(e.s_tm1, np.zeros(len(e), dtype=np.int64), e.r_t, e.discount_t, e.s_t, e.last_t)
+
+
+def _column(v: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(v, dtype=np.float64)[:, None]
+
+
+def _learner(
+    table: Table,
+    step_size: StepCode,
+    lambda_: float,
+    kind: str,
+    update: str,
+    pending: NDArray[np.float64] | None = None,
+) -> Learner:
+    """TD(λ); the increments of a batch are only collected, in ``pending``."""
+    check_choice("kind", kind, KINDS)
+    check_choice("update", update, UPDATES)
+    check_fraction("lambda_", lambda_, "for Monte Carlo use lambda_=1")
+    if table.q.shape[1] != 1:
+        raise ValueError(
+            f"prediction needs a process with one action, got {table.q.shape[1]}; see tabular.under_policy(mdp, pi)"
+        )
+    if kind == "true-online" and (step_size.kind != CONSTANT or step_size.listed.size or update != "step"):
+        raise ValueError('true online TD(λ) is derived for a constant step size and update="step"')
+    size = len(table.q)
+    waiting = np.zeros(size) if pending is None else pending
+    rest = (KINDS.index(kind), UPDATES.index(update), float(lambda_))
+    arguments = (step_size, new_traces(size), waiting, np.zeros(1), *rest)
+    return Learner(run_td, table, acting_code("random"), arguments)

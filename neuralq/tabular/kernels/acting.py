@@ -17,10 +17,25 @@ from neuralq.tabular.kernels.random_numbers import Seed, new_stream, uniform
 from neuralq.tabular.model import ModelArrays
 from neuralq.tabular.policies import EPSILON_GREEDY, K_TO_THE_Q, POWER, RANDOM, SOFTMAX, VISITS, ActingCode, StepCode
 
-__all__ = ["Log", "Table", "Walk", "best_value", "choose", "expected_value", "new_log", "new_walk", "next_step"]
+__all__ = [
+    "BOOTSTRAPS",
+    "Log",
+    "Table",
+    "Walk",
+    "best_value",
+    "choose",
+    "expected_value",
+    "moved",
+    "new_log",
+    "new_walk",
+    "next_step",
+    "step_length",
+]
 
 STEP, STATE, ACTION, EPISODE_STEPS, EPISODES, LIMIT = range(6)
 FORGET, RECORD, REPLAY = range(3)
+BOOTSTRAPS = ("q-learning", "sarsa", "expected-sarsa")
+MAXIMUM, SARSA, EXPECTED = range(3)
 
 _ZERO: Any = np.uint64(0)
 _ONE: Any = np.uint64(1)
@@ -246,6 +261,26 @@ def expected_value(table: Table, s: Any, step: int, policy: ActingCode) -> Any:
 
 
 @lean_kernel
+def moved(value: float, target: float, alpha: float) -> float:
+    """(1 − α) value + α target; with α = 1 the target itself, to the last bit.
+
+    Example:
+        >>> moved(1.0, 3.0, 0.5), moved(1e300, 0.1, 1.0)
+        (2.0, 0.1)
+    """
+    return target if alpha == 1.0 else value + alpha * (target - value)
+
+
+@lean_kernel
+def _draw_outcome(keep: NDArray[np.float64], alias: NDArray[np.uint64], first: Any, num: Any, u: float) -> Any:
+    """The outcome of ``first:first + num`` that a uniform number picks from the alias tables."""
+    x = u * np.float64(num)
+    extra = np.uint64(x)
+    j = first + extra
+    return alias[j] if x - np.float64(extra) >= keep[j] else j
+
+
+@lean_kernel
 def step_length(rule: StepCode, n: int) -> Any:
     """α of the n-th visit of a pair.
 
@@ -280,10 +315,7 @@ def next_step(
             np.uint64(log.s_t[k]), log.a_t[k], log.last_t[k],
         )  # fmt: skip
     if counters[STATE] < 0:
-        x = uniform(rng) * model.start_keep.size
-        j = np.uint64(x)
-        if x - np.float64(j) >= model.start_keep[j]:
-            j = model.start_alias[j]
+        j = _draw_outcome(model.start_keep, model.start_alias, _ZERO, model.start_keep.size, uniform(rng))
         counters[STATE] = np.int64(model.start_state[j])
     hidden = np.uint64(counters[STATE])
     s = model.observe[hidden] if model.observe.size > 0 else hidden
@@ -293,11 +325,7 @@ def next_step(
     j = model.first[pair]
     num_outcomes = model.first[pair + _ONE] - j
     if num_outcomes > _ONE:
-        x = uniform(rng) * np.float64(num_outcomes)
-        extra = np.uint64(x)
-        j += extra
-        if x - np.float64(extra) >= model.keep[j]:
-            j = model.alias[j]
+        j = _draw_outcome(model.keep, model.alias, j, num_outcomes, uniform(rng))
     hidden_t, r_t, ends = model.s_t[j], model.reward[j], model.ends[j]
     s_t = model.observe[hidden_t] if model.observe.size > 0 else hidden_t
     discount_t = 0.0 if ends else gamma

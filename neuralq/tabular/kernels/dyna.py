@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import lean_kernel
-from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, next_step, step_length
+from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, moved, next_step, step_length
 from neuralq.tabular.kernels.random_numbers import uniform
 from neuralq.tabular.model import ModelArrays
 from neuralq.tabular.policies import ActingCode, StepCode
@@ -89,18 +89,10 @@ def run_dyna(
     """``num_steps`` real transitions, each followed by its update and ``num_planning`` imagined ones.
 
     Args:
-        model: where transitions come from, unless ``log`` replays.
-        policy: how to act.
-        table: values and visits, changed in place.
-        walk: where the agent is, changed in place.
-        log: what to record, or to replay.
-        step_size: α by updates of the pair, real or imagined.
-        recall: what is remembered, changed in place.
+        recall: what is remembered. (Updates are counted real or imagined.)
         num_planning: n.
         kappa: κ.
         untried: whether actions never taken are planned with.
-        gamma: γ.
-        num_steps: how many.
     """
     q, counters = table.q, recall.counters
     num_actions = np.uint64(q.shape[1])
@@ -131,5 +123,5 @@ def run_dyna(
             target = recall.reward[x, b] + bonus
             if recall.discount[x, b] != 0.0:
                 target += recall.discount[x, b] * best_value(q, recall.s_t[x, b])
-            q[x, b] = target if alpha == 1.0 else q[x, b] + alpha * (target - q[x, b])
+            q[x, b] = moved(q[x, b], target, alpha)
             counters[BACKUPS] += 1

@@ -1,4 +1,4 @@
-"""Q-learning from a model at full speed: the loop of `neuralq.tabular.onestep` with everything in registers.
+"""Q-learning from a model at full speed: the loop of `neuralq.tabular.kernels.one_step` with everything in registers.
 
 It covers what is run most: Q-learning, no recording, ε-greedy or random actions. Draw for draw it does what the general
 kernel does; tests/test_tabular.py holds the two to the same bits.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from neuralq.jit import lean_kernel
-from neuralq.tabular.kernels.acting import EPISODE_STEPS, EPISODES, LIMIT, STATE, STEP, Table, Walk, step_length
+from neuralq.tabular.kernels.acting import EPISODE_STEPS, EPISODES, LIMIT, STATE, STEP, Table, Walk, moved, step_length
 from neuralq.tabular.model import ModelArrays
 from neuralq.tabular.policies import RANDOM, VISITS, ActingCode, StepCode
 
@@ -26,7 +26,7 @@ _UNIT = 1.0 / (1 << 53)
 
 @lean_kernel
 def _draw(s0: Any, s1: Any, s2: Any, s3: Any) -> Any:
-    """`streams.uniform` with its state in registers."""
+    """`random_numbers.uniform` with its state in registers."""
     total = s0 + s3
     result = ((total << _OUT) | (total >> _OUT_BACK)) + s0
     shifted = s1 << _STEP
@@ -43,17 +43,7 @@ def _draw(s0: Any, s1: Any, s2: Any, s3: Any) -> Any:
 def run_q_learning(
     model: ModelArrays, policy: ActingCode, table: Table, walk: Walk, step_size: StepCode, gamma: float, num_steps: int
 ) -> None:
-    """``num_steps`` transitions from the model, each followed by its update.
-
-    Args:
-        model: where transitions come from.
-        policy: ε-greedy or random.
-        table: values and visits, changed in place.
-        walk: where the agent is, changed in place.
-        step_size: α by visits of the pair.
-        gamma: γ.
-        num_steps: how many.
-    """
+    """``num_steps`` transitions from the model, each followed by its update; ε-greedy or random."""
     q, visits, num_legal = table.q, table.visits, table.num_legal
     first, keep, alias = model.first, model.keep, model.alias
     successor, reward, ending = model.s_t, model.reward, model.ends
@@ -131,7 +121,7 @@ def run_q_learning(
             for b in range(_ONE, num_actions):
                 top = max(top, q[s_t, b])
             target += gamma * top
-        q[s, a] = target if alpha == 1.0 else q[s, a] + alpha * (target - q[s, a])
+        q[s, a] = moved(q[s, a], target, alpha)
         left -= 1
         begin = ends or left <= 0
         s = s_t

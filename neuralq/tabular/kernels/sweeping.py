@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neuralq.checks import check_whole
 from neuralq.jit import lean_kernel
-from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, next_step, step_length
+from neuralq.tabular.kernels.acting import Log, Table, Walk, best_value, moved, next_step, step_length
 from neuralq.tabular.model import ModelArrays
 from neuralq.tabular.policies import ActingCode, StepCode
 
@@ -50,14 +51,19 @@ class Memory(NamedTuple):
     counters: NDArray[np.int64]
 
 
-def new_memory(num_states: int, num_pairs: int, max_outcomes: int) -> Memory:
+def new_memory(shape: tuple[int, ...], max_outcomes: int) -> Memory:
     """A memory of nothing.
 
+    Raises:
+        ValueError: room for no outcome.
+
     Example:
-        >>> new_memory(2, 4, 3).s_t.shape
+        >>> new_memory((2, 2), 3).s_t.shape
         (4, 3)
     """
-    p, b, whole = num_pairs, max_outcomes, np.int64
+    check_whole("max_outcomes", max_outcomes)
+    num_states, num_actions = shape
+    p, b, whole = num_states * num_actions, max_outcomes, np.int64
     return Memory(
         np.zeros((p, b), whole), np.zeros((p, b), np.uint64), np.zeros((p, b)), np.zeros(p), np.zeros(p),
         np.zeros(p, whole), np.full(num_states, -1, whole), np.full(p * b, -1, whole), np.zeros(p, np.uint64),
@@ -187,20 +193,12 @@ def run_sweeping(
     """``num_steps`` real transitions, each followed by up to ``num_planning`` backups of the worst pairs.
 
     Args:
-        model: where transitions come from, unless ``log`` replays.
-        policy: how to act.
-        table: values and visits, changed in place.
-        walk: where the agent is, changed in place.
-        log: what to record, or to replay.
-        step_size: α by backups of the pair.
-        memory: the learned model and the queue, changed in place.
+        memory: the learned model and the queue.
         kind: FULL (expected backups of counted outcomes) or SAMPLE (the last outcome stands for all).
         num_planning: n.
         threshold: θ.
         bored: pairs tried fewer times are worth ``optimistic``.
         optimistic: that value.
-        gamma: γ.
-        num_steps: how many.
     """
     q = table.q
     num_actions = np.uint64(q.shape[1])
@@ -221,7 +219,7 @@ def run_sweeping(
             memory.updates[x] += 1
             alpha = step_length(step_size, memory.updates[x])
             target = _target(memory, table, x, kind, bored, optimistic)
-            q[sx, ax] = target if alpha == 1.0 else q[sx, ax] + alpha * (target - q[sx, ax])
+            q[sx, ax] = moved(q[sx, ax], target, alpha)
             memory.counters[BACKUPS] += 1
             if alpha != 1.0:
                 _offer(memory, x, abs(target - q[sx, ax]), threshold)
