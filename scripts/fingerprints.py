@@ -90,7 +90,7 @@ def short(learner: str, layout: str, engine: str, settings: dict[str, Any]) -> d
 def resumed(config: dict[str, Any], folder: Path) -> str:
     """Half of the run, then the rest of it."""
     neuralq.train(neuralq.with_preset({**config, "total_steps": 300}), folder)
-    return neuralq.resume(folder, total_steps=600).parameters_sha256
+    return str(neuralq.resume(folder, total_steps=600).parameters_sha256)
 
 
 def backgammon(mode: str) -> str:

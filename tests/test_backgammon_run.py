@@ -178,8 +178,9 @@ def test_what_was_learned_plays(tmp_path: Path) -> None:
         load_agent(tmp_path / "nothing.safetensors")
     with pytest.raises(RunFolderError, match="no TD-Gammon run"):
         load_agent(tmp_path)
-    with pytest.raises(ValueError, match="TD-Gammon run"):
-        neuralq.resume(run.run_dir)
+    with pytest.raises(ValueError, match="is a TD-Gammon run, whose budget is num_games and not total_steps"):
+        neuralq.resume(run.run_dir, total_steps=10**6)
+    assert neuralq.resume(run.run_dir) == run  # finished, and stays as it is
 
 
 def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:

@@ -20,8 +20,9 @@ from neuralq.q import MLP
 from neuralq.runs import RunConfig, evaluate_run, load, resume, train
 from neuralq.runs import loop as training
 from neuralq.runs.evaluation import Evaluation
-from neuralq.runs.folder.best import keep_best, load_best
+from neuralq.runs.folder.best import Best, keep_best, load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
+from neuralq.runs.session import Session
 
 CONFIG = RunConfig(
     total_steps=64, evaluate_every=16, evaluation_episodes=2, log_every=64, checkpoint_every=16, body=MLP((4,)),
@@ -33,11 +34,11 @@ def scripted(monkeypatch: pytest.MonkeyPatch, scores: list[float]) -> list[torch
     """Evaluations score these numbers, one after another; the parameters at each are collected."""
     seen: list[torch.Tensor] = []
 
-    def evaluate(session: training.Session, *_: int) -> Evaluation:
+    def play(session: Session, seed: int) -> Evaluation:
         seen.append(session.learner.engine.flat.values.clone())
         return Evaluation((scores[len(seen) - 1],), (1,), 0)
 
-    monkeypatch.setattr(training.Session, "evaluate", evaluate)
+    monkeypatch.setattr(Session, "play_greedily", play)
     return seen
 
 
@@ -76,7 +77,7 @@ def test_keeping_changes_nothing_in_the_run(tmp_path: Path, monkeypatch: pytest.
 
 def test_statistics_of_observations_are_kept_along(tmp_path: Path) -> None:
     statistics = {"observation_mean": np.array([1.0, 2.0]), "observation_count": np.array([3.0])}
-    keep_best(tmp_path, 10, 1.5, torch.arange(3.0), statistics)
+    keep_best(tmp_path, Best(10, 1.5, torch.arange(3.0), statistics))
     best = load_best(tmp_path)
     assert (best.env_steps, best.greedy_return) == (10, 1.5) and best.parameters.tolist() == [0.0, 1.0, 2.0]
     assert best.normalisation is not None

@@ -26,9 +26,9 @@ from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import evaluate_greedy
 from neuralq.runs.folder.env_probe import Resumability
-from neuralq.runs.loop import Session
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session
+from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, SubEnv, legal_actions, make_vector_env
 from neuralq.runs.stream.acting import choose_epsilon_greedy, choose_greedy
 

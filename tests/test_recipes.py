@@ -101,8 +101,8 @@ def test_a_plan_is_the_configurations() -> None:
     plan = plan_of(
         RunConfig(total_steps=7, stop_at_return=1.5, evaluate_every=3, checkpoint_every=4, log_every=2, seed=5)
     )
-    assert (plan.total_steps, plan.stop_at_return, plan.evaluate_every) == (7, 1.5, 3)
-    assert (plan.checkpoint_every, plan.log_every, plan.seed, plan.evaluation_episodes) == (4, 2, 5, 20)
+    assert (plan.budget, plan.stop_at_return, plan.evaluate_every) == (7, 1.5, 3)
+    assert (plan.checkpoint_every, plan.log_every, plan.seed) == (4, 2, 5)
 
 
 @pytest.mark.parametrize(
@@ -112,6 +112,7 @@ def test_a_plan_is_the_configurations() -> None:
 def test_the_layout_decides_the_representation(layout: str, kind: type) -> None:
     body = None if layout == "linear" else MLP((4,))
     session = build_session(RunConfig(layout=layout, body=body, evaluation_episodes=1))
+    assert (session.evaluation_episodes, session.evaluation_max_steps, session.seed) == (1, 10_000, 0)
     try:
         assert type(session.learner.engine.q) is kind
         q = build_q(RunConfig(layout=layout, body=body), session.stream.spec, np.random.default_rng(0))

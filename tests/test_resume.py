@@ -441,11 +441,11 @@ def test_divergence_is_told_and_never_saved(case: str, tmp_path: Path) -> None:
         if row["env_steps"] >= 300:
             poison[0].learner.engine.flat.values[:] = torch.nan
 
-    from neuralq.runs import api as recipe_run
+    from neuralq.runs import control
 
-    build = recipe_run.build_session
+    build = control.build_session
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(recipe_run, "build_session", lambda config: poison.append(build(config)) or poison[0])
+        patched.setattr(control, "build_session", lambda config: poison.append(build(config)) or poison[0])
         with pytest.raises(Diverged, match=r"no longer finite.*smaller step size"):
             train(config, tmp_path / "run", [spoil])
     saved = checkpoint.load_newest(tmp_path / "run" / "checkpoints")

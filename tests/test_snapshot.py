@@ -31,6 +31,7 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import is_resumable
 from neuralq.runs.folder.env_restore import restore_env
+from neuralq.runs.stream import make_vector_env
 
 NEWEST_TAXI = max(name for name in gymnasium.registry if name.startswith("Taxi-v"))
 CLASSIC = ["CartPole-v1", NEWEST_TAXI, "FrozenLake-v1", "Blackjack-v1", "MountainCar-v0", "Acrobot-v1", "Pendulum-v1"]
@@ -399,3 +400,42 @@ def test_another_construction_is_refused() -> None:
     for foreign in ({}, {"snapshot": 2}, {"snapshot": 1}, {"snapshot": 1, "root": {"kind": "object"}}):
         with pytest.raises(NotCopyable):
             restore_env(gymnasium.make("CartPole-v1"), foreign)
+
+
+def test_a_state_that_an_earlier_version_wrote_is_restored() -> None:
+    # As of 0.3.1: where classes that stand in the state were, before they were moved.
+    moved = {
+        "neuralq.runs.stream.vector_env.SubEnv": "neuralq.interact.lanes.Lane",
+        "neuralq.runs.stream.encoding.": "neuralq.features.",
+        "neuralq.mdp.model.": "neuralq.mdp.",
+        "neuralq.mdp.environment.": "neuralq.simulate.",
+        "neuralq.mdp.sampler.": "neuralq.simulate.",
+        "neuralq.mdp.outcomes.": "neuralq.simulate.",
+    }
+    seen: set[str] = set()
+
+    def as_before(node: Any) -> Any:
+        if isinstance(node, list | tuple):
+            return type(node)(map(as_before, node))
+        if isinstance(node, dict):
+            return {key: as_before(value) for key, value in node.items()}
+        for now, before in moved.items():
+            if isinstance(node, str) and node.startswith(now):
+                seen.add(before)
+                return before + node.removeprefix(now)
+        return node
+
+    model = FiniteMDP.garnet(5, 2, 2, seed=0)
+    makers = (
+        lambda: make_vector_env(model.as_env, 2),
+        lambda: make_vector_env(lambda: gymnasium.make("CartPole-v1"), 2),
+        lambda: model.as_vector_env(3, max_episode_steps=4),
+    )
+    for make in makers:
+        saved, fresh = make(), make()
+        saved.reset(seed=3)
+        saved.step(np.zeros(saved.num_envs, np.int64))
+        restore_env(fresh, as_before(encode_env(saved)))
+        actions = np.ones(saved.num_envs, np.int64)
+        np.testing.assert_array_equal(saved.step(actions)[0], fresh.step(actions)[0])
+    assert seen == set(moved.values())

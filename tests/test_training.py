@@ -19,12 +19,12 @@ from gymnasium import spaces
 
 from neuralq.learners import OnlineSettings, RolloutSettings
 from neuralq.runs import RunConfig, train
-from neuralq.runs import clock as stopwatch
 from neuralq.runs import loop as training
 from neuralq.runs.evaluation import Evaluation
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.run_folder import read_metrics, read_summary
 from neuralq.runs.loop import seed_for
+from neuralq.runs.session import Session
 
 
 class Corridor(gym.Env[Any, Any]):
@@ -106,19 +106,18 @@ def test_training_rows_tell_the_mean_of_finished_episodes(tmp_path: Path) -> Non
 
 def test_evaluation_counts_as_wall_time_but_not_as_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    evaluate = training.Session.evaluate
+    play = Session.play_greedily
 
-    def slow_evaluation(session: training.Session, num_episodes: int, seed: int, max_steps: int) -> Evaluation:
+    def slow_evaluation(session: Session, seed: int) -> Evaluation:
         now[0] += 100.0
-        return evaluate(session, num_episodes, seed, max_steps)
+        return play(session, seed)
 
     def tick() -> float:
         now[0] += 0.001
         return now[0]
 
-    for module in (training, stopwatch):
-        monkeypatch.setattr(module, "time", SimpleNamespace(process_time=tick, perf_counter=tick))
-    monkeypatch.setattr(training.Session, "evaluate", slow_evaluation)
+    monkeypatch.setattr(training, "time", SimpleNamespace(process_time=tick, perf_counter=tick))
+    monkeypatch.setattr(Session, "play_greedily", slow_evaluation)
     run = train(corridor(), tmp_path / "run")
     assert run.cpu_seconds < 1.0 and 400.0 < run.wall_seconds < 401.0
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # known to type checkers
 if TYPE_CHECKING:
-    from neuralq.runs.api import Run as Run
-    from neuralq.runs.api import evaluate_run as evaluate_run
     from neuralq.runs.api import load as load
     from neuralq.runs.api import resume as resume
     from neuralq.runs.api import train as train
+    from neuralq.runs.control import Run as Run
+    from neuralq.runs.control import evaluate_run as evaluate_run
     from neuralq.runs.recipe.config import RunConfig as RunConfig
     from neuralq.runs.recipe.presets import preset_for as preset_for
     from neuralq.runs.recipe.presets import with_preset as with_preset
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 __all__ = ["Run", "RunConfig", "evaluate_run", "load", "preset_for", "resume", "train", "with_preset"]
 
 _HOMES = {
-    **dict.fromkeys(("Run", "evaluate_run", "load", "resume", "train"), "neuralq.runs.api"),
+    **dict.fromkeys(("load", "resume", "train"), "neuralq.runs.api"),
+    **dict.fromkeys(("Run", "evaluate_run"), "neuralq.runs.control"),
     "RunConfig": "neuralq.runs.recipe.config",
     **dict.fromkeys(("preset_for", "with_preset"), "neuralq.runs.recipe.presets"),
 }

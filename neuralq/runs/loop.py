@@ -1,39 +1,36 @@
-"""The training loop: a fold of the stream of experience through feed, learner and hooks.
+"""The training loop, whatever trains: when rows are written, and when the run is evaluated, saved and stopped.
 
-It knows no algorithm. What a run consists of is in `Session`, what is asked of it in `Plan`, how far it has come in
-`Progress`; a checkpoint holds exactly the first and the last, so a run that stops anywhere goes on bit for bit.
+It knows no algorithm and no kind of run. What trains is a `Trainee`, what is asked of it a `Plan`, how far it has come
+its `Progress`; a checkpoint holds exactly the first and the last, so a run that stops anywhere goes on bit for bit.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from gymnasium.vector import VectorEnv
-from torch import Tensor
 
+from neuralq.learners.learner import Learner
 from neuralq.runs.folder import checkpoint
-from neuralq.runs.folder.best import keep_best
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy
-from neuralq.runs.stream.experience import ExperienceSource, Sample
-from neuralq.runs.stream import Interaction, Policy
-from neuralq.learners.averaging import evaluation_parameters, evaluating_with
-from neuralq.learners.learner import Learner, Update
+from neuralq.runs.folder.best import Best, keep_best
 from neuralq.runs.folder.run_folder import RunFolder
-from neuralq.runs.folder.env_encode import encode_env
-from neuralq.runs.folder.env_probe import Resumability
-from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.clock import Stopwatch
-from neuralq.types import Transition
+from neuralq.runs.stream.experience import Sample
 
-__all__ = ["Diverged", "Hook", "Observer", "Plan", "Progress", "Session", "fit", "restore", "seed_for"]
+__all__ = [
+    "Diverged",
+    "Hook",
+    "Observer",
+    "Plan",
+    "Progress",
+    "Trainee",
+    "continued",
+    "fit",
+    "seed_for",
+]
 
 
 class Hook(Protocol):
@@ -64,81 +61,105 @@ class Diverged(RuntimeError):
     """The parameters are no longer finite numbers; the last checkpoint is from before that."""
 
 
-@dataclass
-class Session:
-    """The mutable parts of a run, and nothing else.
+class Trainee(Protocol):
+    """What the loop asks of whatever trains."""
 
-    Args:
-        stream: experience from the training environments.
-        policy: the behaviour.
-        feed: between stream and learner.
-        learner: what learns.
-        generators: every generator in use, by name.
-        evaluation_stream: an interaction with an environment made for evaluation.
-        resumability: whether the environments' state can be saved.
-    """
+    @property
+    def unit(self) -> str:
+        """What training is counted in, as the column of metrics is called: "env_steps" or "games"."""
+        ...
 
-    stream: Interaction
-    policy: Policy
-    experience: ExperienceSource
-    learner: Learner
-    generators: dict[str, np.random.Generator]
-    evaluation_stream: Interaction
-    resumability: Resumability
+    @property
+    def amount(self) -> int:
+        """Units of training so far."""
+        ...
 
-    def evaluate(self, num_episodes: int, seed: int, max_steps: int) -> Evaluation:
-        """Greedy evaluation of the parameters that the learner plays with."""
-        with evaluating_with(self.learner):
-            return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, max_steps)
+    @property
+    def env_steps(self) -> int:
+        """Environment steps so far, by which rows and checkpoints are numbered."""
+        ...
+
+    @property
+    def observed(self) -> tuple[Learner, Sample] | None:
+        """What an `Observer` is shown, if there is a learner that has learned from a sample."""
+        ...
+
+    def advance(self, until: int, request: StopRequest) -> None:
+        """Train at least once, up to ``until`` units at most where it can, to a point where it may be saved.
+
+        It may come back earlier, and does at the next such point once a stop is requested.
+        """
+        ...
+
+    def training_row(self) -> dict[str, Any]:
+        """Columns of training metrics, beside those that every run has."""
+        ...
+
+    def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
+        """Measure what has been learned; training goes on as if it had not been measured.
+
+        Returns:
+            Columns of metrics, none where nothing is measured; and the parameters with their score, by which the best
+            of the run are chosen and a target is met, or None where neither is wanted.
+        """
+        ...
+
+    def require_finite(self) -> None:
+        """Raises `Diverged` if the parameters are no longer finite."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a continued run needs; what `Progress` does not know of its progress, under ``progress``."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit."""
+        ...
 
     def close(self) -> None:
-        """Close the environments."""
-        for stream in (self.stream, self.evaluation_stream):
-            with contextlib.suppress(Exception):
-                stream.envs.close()
+        """Give back what it holds of the system."""
+        ...
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of a run. Steps are environment steps, summed over parallel environments.
+    """What is asked of a run. Amounts are in the unit of what trains.
 
     Args:
-        total_steps: budget.
-        stop_at_return: stop once a greedy evaluation averages at least this; None to use the whole budget.
-        evaluate_every: steps between greedy evaluations.
-        evaluation_episodes: episodes of each.
-        evaluation_max_steps: bound on an evaluation episode where the environment has none.
-        checkpoint_every: steps between checkpoints.
-        log_every: steps between rows of training metrics.
+        budget: how much training.
+        evaluate_every: between evaluations.
+        checkpoint_every: between checkpoints.
+        log_every: between rows of training metrics.
         seed: from which evaluation seeds are derived.
+        stop_at_return: stop once an evaluation scores at least this; None to use the whole budget.
+        log_whole_periods: whether rows of training metrics come at multiples of ``log_every`` and at the end, or at
+            the very beginning and ``log_every`` after each other.
     """
 
-    total_steps: int
-    stop_at_return: float | None
+    budget: int
     evaluate_every: int
-    evaluation_episodes: int
-    evaluation_max_steps: int
     checkpoint_every: int
     log_every: int
     seed: int
+    stop_at_return: float | None = None
+    log_whole_periods: bool = False
 
 
 @dataclass
 class Progress:
-    """How far a run has come.
+    """How far a run has come, beside what only what trains knows.
 
     Args:
-        env_steps: environment steps.
         cpu_seconds: CPU time of training, evaluations excluded.
         wall_seconds: wall time of training and evaluation.
-        greedy_return: mean of the last greedy evaluation, None before the first.
-        best_return: best mean so far.
-        evaluated_at: steps at which that was.
-        reached_at: steps at which ``stop_at_return`` was first met.
+        greedy_return: score of the last evaluation, None before the first.
+        best_return: best score so far.
+        evaluated_at: amount of training at the last evaluation.
+        reached_at: amount at which ``stop_at_return`` was first met.
         finished: whether the run has ended by itself.
+        interrupted_by: name of the signal that ended it early.
     """
 
-    env_steps: int = 0
     cpu_seconds: float = 0.0
     wall_seconds: float = 0.0
     greedy_return: float | None = None
@@ -149,8 +170,6 @@ class Progress:
     next_evaluation: int = 0
     next_checkpoint: int = 0
     next_log: int = 0
-    recent_returns: list[float] = field(default_factory=list)
-    last_metrics: dict[str, float] = field(default_factory=dict)
     interrupted_by: str | None = None
 
 
@@ -164,13 +183,27 @@ def seed_for(seed: int, *purpose: int) -> int:
     return int(np.random.SeedSequence([seed, *purpose]).generate_state(1)[0] >> 1)
 
 
-def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> Progress:
+def continued(trainee: Trainee, folder: RunFolder) -> Progress:
+    """How far the run in a folder has come, with ``trainee``, freshly built, put where its newest checkpoint stood.
+
+    Raises:
+        CheckpointError: if there are checkpoints and none is intact.
+    """
+    if not any(folder.checkpoints_path.glob("step-*")):
+        return Progress()
+    state = checkpoint.load_newest(folder.checkpoints_path).state
+    trainee.load_state_dict(state)
+    known = {f.name for f in fields(Progress)}
+    return Progress(**{name: value for name, value in state["progress"].items() if name in known})
+
+
+def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> None:
     """Train until the plan is met, the budget is spent or a signal asks to stop; the folder then holds a checkpoint.
 
     Args:
-        session: what trains; changed in place.
+        trainee: what trains; changed in place.
         plan: when to evaluate, save and stop.
-        progress: where to begin; changed in place and returned.
+        progress: where to begin; changed in place.
         folder: an open run folder.
         hooks: called with each row of metrics.
 
@@ -178,53 +211,39 @@ def fit(session: Session, plan: Plan, progress: Progress, folder: RunFolder, hoo
         EnvironmentFault: if an environment breaks its contract. The last checkpoint stays as it is.
         Diverged: if the parameters stop being finite. Likewise.
     """
-    loop = _Loop(session, plan, progress, folder, hooks)
+    loop = _Loop(trainee, plan, progress, folder, hooks)
     request = StopRequest()
     with request.listening():
         try:
             loop.run(request)
-        except ValueError as error:  # NaN among the values: the policy notices before the next checkpoint would
-            _refuse_divergence(session, progress)
-            raise error
-    return progress
-
-
-def _refuse_divergence(session: Session, progress: Progress) -> None:
-    if not bool(torch.isfinite(session.learner.engine.flat.values).all()):
-        raise Diverged(
-            f"after {progress.env_steps:,} environment steps the parameters are no longer finite: training "
-            "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
-            "or λ nearer 1"
-        )
+        except ValueError:  # NaN among the values: the policy notices before the next checkpoint would
+            trainee.require_finite()
+            raise
 
 
 class _Loop:
     def __init__(
-        self, session: Session, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]
+        self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]
     ) -> None:
-        self.session, self.plan, self.progress, self.folder, self.hooks = session, plan, progress, folder, hooks
-        self.recent = deque(progress.recent_returns, maxlen=100)
-        self.last_update: Update | None = None
-        self.last_sample: Sample | None = None
-        self.device = session.learner.engine.flat.values.device
-        self._clock = Stopwatch(progress)
-        self._log_clock = (progress.env_steps, time.perf_counter())
+        self.trainee, self.plan, self.progress, self.folder, self.hooks = trainee, plan, progress, folder, hooks
         progress.finished = False
         progress.interrupted_by = None
-        for name, period in (("evaluation", plan.evaluate_every), ("checkpoint", plan.checkpoint_every)):
-            if getattr(progress, f"next_{name}") == 0:
-                setattr(progress, f"next_{name}", period)
+        progress.next_evaluation = progress.next_evaluation or plan.evaluate_every
+        progress.next_checkpoint = progress.next_checkpoint or plan.checkpoint_every
+        if plan.log_whole_periods:
+            progress.next_log = progress.next_log or plan.log_every
+        self._cpu, self._wall = time.process_time(), time.perf_counter()
+        self._rate_since = (trainee.amount, time.perf_counter())
 
     def run(self, request: StopRequest) -> None:
-        session, plan, progress = self.session, self.plan, self.progress
-        # A rollout that was begun is finished: half of one can be neither learned from nor saved.
-        while progress.env_steps < plan.total_steps or not session.experience.between_samples:
-            self._advance()
-            if not session.experience.between_samples:
-                continue
-            if progress.env_steps >= progress.next_log:
+        trainee, plan, progress = self.trainee, self.plan, self.progress
+        while trainee.amount < plan.budget:
+            next_look = min(progress.next_log, progress.next_evaluation, progress.next_checkpoint, plan.budget)
+            trainee.advance(next_look, request)
+            amount = trainee.amount
+            if amount >= progress.next_log or (plan.log_whole_periods and amount >= plan.budget):
                 self._log()
-            if progress.env_steps >= progress.next_evaluation:
+            if amount >= progress.next_evaluation:
                 self._evaluate()
                 if plan.stop_at_return is not None and progress.reached_at is not None:
                     break
@@ -232,137 +251,74 @@ class _Loop:
                 progress.interrupted_by = request.name
                 self._save()
                 return
-            if progress.env_steps >= progress.next_checkpoint:
+            if amount >= progress.next_checkpoint:
                 self._save()
-        if progress.evaluated_at != progress.env_steps:
+        if progress.evaluated_at != trainee.amount:
             self._evaluate()
-        self._clock.read()
         progress.finished = True
         self._save()
 
-    def _advance(self) -> None:
-        session = self.session
-        step = session.stream.step(session.policy)
-        session.experience.add(step)
-        for episode in step.episodes:
-            self.recent.append(episode.episode_return)
-        for sample in session.experience.draw():
-            update = session.learner.update(*self._on_device(sample))
-            session.experience.return_errors(sample, update.errors)
-            self.last_update, self.last_sample = update, sample
-        self.progress.env_steps = session.stream.num_steps
+    def _book(self, training: bool = True) -> None:
+        """Books the time since this was last called; what is no training counts as wall time only."""
+        cpu, wall = time.process_time(), time.perf_counter()
+        if training:
+            self.progress.cpu_seconds += cpu - self._cpu
+        self.progress.wall_seconds += wall - self._wall
+        self._cpu, self._wall = cpu, wall
 
-    def _on_device(self, sample: Sample) -> tuple[Transition, Tensor | None]:
-        """The sample where the learner computes; on the CPU it stays where it is.
+    def _after(self, period: int) -> int:
+        return (self.trainee.amount // period + 1) * period
 
-        Weights stay on the host: which of them are 0 is asked there, and learners that multiply by them move them.
-        """
-        if self.device.type == "cpu":
-            return sample.transition, sample.weight
-        return sample.transition.map(lambda x: x.to(self.device)), sample.weight
-
-    def _record(self, row: dict[str, Any]) -> None:
-        self.folder.append_metrics(row)
-        for hook in self.hooks:
-            if self.last_sample is not None and isinstance(hook, Observer):
-                hook.observe(self.session.learner, self.last_sample)
-            hook(row)
-        self._clock.read(training=False)  # whoever watches costs wall time only
-
-    def _last_metrics(self) -> dict[str, float]:
-        """Of the last update, which may have been before the run was resumed."""
-        return self.progress.last_metrics if self.last_update is None else self.last_update.metrics()
-
-    def _log(self) -> None:
-        self._clock.read()
-        progress = self.progress
-        progress.next_log = progress.env_steps + self.plan.log_every
-        then, now = self._log_clock, (progress.env_steps, time.perf_counter())
-        self._log_clock = now
-        row: dict[str, Any] = {
-            "kind": "train",
-            "env_steps": progress.env_steps,
+    def _record(self, kind: str, columns: dict[str, Any]) -> None:
+        trainee, progress = self.trainee, self.progress
+        row = {
+            "kind": kind,
+            "env_steps": trainee.env_steps,
+            trainee.unit: trainee.amount,
             "cpu_seconds": progress.cpu_seconds,
             "wall_seconds": progress.wall_seconds,
-            "steps_per_second": (now[0] - then[0]) / max(now[1] - then[1], 1e-9),
-            "episode_return": float(np.mean(self.recent)) if self.recent else None,
-            "num_updates": self.session.learner.num_updates,
+            **columns,
         }
-        self._record(row | self._last_metrics())
+        self.folder.append_metrics(row)
+        observed = trainee.observed
+        for hook in self.hooks:
+            if observed is not None and isinstance(hook, Observer):
+                hook.observe(*observed)
+            hook(row)
+        self._book(training=False)  # whoever watches costs wall time only
+
+    def _log(self) -> None:
+        self._book()
+        trainee, period = self.trainee, self.plan.log_every
+        columns = trainee.training_row()
+        self.progress.next_log = self._after(period) if self.plan.log_whole_periods else trainee.amount + period
+        then, now = self._rate_since, (trainee.amount, time.perf_counter())
+        self._rate_since = now
+        rate = (now[0] - then[0]) / max(now[1] - then[1], 1e-9)
+        self._record("train", {f"{trainee.unit.removeprefix('env_')}_per_second": rate, **columns})
 
     def _evaluate(self) -> None:
-        self._clock.read()
-        session, plan, progress = self.session, self.plan, self.progress
-        progress.next_evaluation = (progress.env_steps // plan.evaluate_every + 1) * plan.evaluate_every
-        progress.evaluated_at = progress.env_steps
-        seed = seed_for(plan.seed, 9, progress.env_steps)
-        result = session.evaluate(plan.evaluation_episodes, seed, plan.evaluation_max_steps)
-        progress.greedy_return = result.mean
-        if progress.best_return is None or result.mean > progress.best_return:
-            progress.best_return = result.mean
-            seen = None if session.stream.normalisation is None else session.stream.normalisation.state_dict()
-            keep_best(self.folder.path, progress.env_steps, result.mean, evaluation_parameters(session.learner), seen)
-        if plan.stop_at_return is not None and progress.reached_at is None and result.mean >= plan.stop_at_return:
-            progress.reached_at = progress.env_steps
-        self._clock.read(training=False)
-        self._record(
-            {
-                "kind": "evaluation",
-                "env_steps": progress.env_steps,
-                "cpu_seconds": progress.cpu_seconds,
-                "wall_seconds": progress.wall_seconds,
-                "greedy_return": result.mean,
-                "returns": list(result.returns),
-                "num_cut": result.num_cut,
-            }
-        )
+        self._book()
+        trainee, plan, progress = self.trainee, self.plan, self.progress
+        progress.next_evaluation = self._after(plan.evaluate_every)
+        progress.evaluated_at = trainee.amount
+        columns, scored = trainee.evaluate(seed_for(plan.seed, 9, trainee.amount))
+        if scored is not None:
+            score = progress.greedy_return = scored.greedy_return
+            if progress.best_return is None or score > progress.best_return:
+                progress.best_return = score
+                keep_best(self.folder.path, scored)
+            if plan.stop_at_return is not None and progress.reached_at is None and score >= plan.stop_at_return:
+                progress.reached_at = trainee.amount
+        self._book(training=False)
+        self._rate_since = (trainee.amount, time.perf_counter())
+        if columns:
+            self._record("evaluation", columns)
 
     def _save(self) -> None:
-        progress = self.progress
-        progress.recent_returns = list(self.recent)
-        progress.last_metrics = self._last_metrics()
-        period = self.plan.checkpoint_every
-        progress.next_checkpoint = (progress.env_steps // period + 1) * period
-        _refuse_divergence(self.session, progress)
-        self._clock.read()
-        checkpoint.save(self.folder.checkpoints_path, progress.env_steps, _state(self.session, progress))
-
-
-def _state(session: Session, progress: Progress) -> dict[str, Any]:
-    """Everything that a continued run needs, as one tree."""
-    exact = session.resumability.exact
-    return {
-        "progress": asdict(progress),
-        "learner": session.learner.state_dict(),
-        "feed": session.experience.state_dict(),
-        "stream": session.stream.state_dict(),
-        "environments": encode_env(session.stream.envs) if exact else None,
-        "generators": {name: rng.bit_generator.state for name, rng in session.generators.items()},
-    }
-
-
-def restore(session: Session, state: Mapping[str, Any], seed: int) -> Progress:
-    """Put a freshly built session where the saved one stood.
-
-    Where the environments' state could not be saved, every environment starts a new episode, with a seed of its own.
-
-    Args:
-        session: built from the same configuration; changed in place.
-        state: what a checkpoint holds.
-        seed: of the run.
-    """
-    session.learner.load_state_dict(state["learner"])
-    session.experience.load_state_dict(state["feed"])
-    for name, rng in session.generators.items():
-        rng.bit_generator.state = state["generators"][name]
-    progress = Progress(**state["progress"])
-    environments: VectorEnv[Any, Any, Any] = session.stream.envs
-    if state["environments"] is not None:
-        restore_env(environments, state["environments"])
-        session.stream.load_state_dict(state["stream"])
-    else:
-        session.stream.load_normalisation(state["stream"])
-        session.stream.restart(seed_for(seed, 8, progress.env_steps))
-        session.stream.num_steps = progress.env_steps
-        session.learner.begin_streams()
-    return progress
+        self.progress.next_checkpoint = self._after(self.plan.checkpoint_every)
+        self.trainee.require_finite()
+        self._book()
+        state = self.trainee.state_dict()
+        state["progress"] |= {name: value for name, value in asdict(self.progress).items() if value is not None}
+        checkpoint.save(self.folder.checkpoints_path, self.trainee.env_steps, state)

@@ -21,7 +21,7 @@ from neuralq.apps.cli import Failure, print_result
 from neuralq.runs.folder.run_folder import read_config, refuse_old_run
 from neuralq.systems.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
 from neuralq.systems.backgammon.match import OPPONENTS
-from neuralq.systems.backgammon.run import GammonRun, default_path, resume_games, train_games
+from neuralq.systems.backgammon.run import TD_GAMMON, GammonRun, resume_games, train_games
 from neuralq.systems.backgammon.selfplay import SelfPlaySettings
 
 __all__ = ["GameBar", "resume_td_gammon", "train_td_gammon"]
@@ -51,7 +51,7 @@ def train_td_gammon(argv: list[str]) -> int:
         config = _config(options)
     except ValueError as error:
         raise Failure(_in_options(str(error)), 2) from error
-    path = Path(options.run_dir or default_path(config))
+    path = Path(options.run_dir or TD_GAMMON.default_path(config))
     refuse_old_run(path)  # also by train_games, but preparing takes seconds
     _say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
     with GameBar(config.budget) as bar:
@@ -187,7 +187,7 @@ def _conclude(run: GammonRun, as_json: bool) -> int:
           run.points_per_game.items()),
         f"run folder {run.run_dir}",
     ]  # fmt: skip
-    print_result(run.summary(), as_json, lines)
+    print_result(run.plain(), as_json, lines)
     return 0 if run.interrupted_by is None else 128 + signal.Signals[run.interrupted_by].value
 
 

@@ -49,7 +49,7 @@ def demo(argv: list[str]) -> int:
     }
     path = write_demo_report(folder / "report.html", read_metrics(run.run_dir), facts, results, target=TARGET)
     seconds = time.perf_counter() - began
-    plain = {**run.summary(), "report": str(path), "seconds": seconds, "baird": plain_star(predictions, results)}
+    plain = {**run.plain(), "report": str(path), "seconds": seconds, "baird": plain_star(predictions, results)}
     print_result(plain, options.json, [f"report: {path} ({seconds:.0f} s in all)"])
     if not run.reached:
         raise Failure(f"CartPole-v1 did not reach {TARGET:g} with seed {options.seed}; try another seed")

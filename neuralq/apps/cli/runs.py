@@ -187,7 +187,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     if run.engine != "compiled" and not forced:
         _say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")
     best = _best_return(run)
-    summary = {**run.summary(), "best_return": best, "report": report_path}
+    summary = {**run.plain(), "best_return": best, "report": report_path}
     score = "not evaluated" if run.greedy_return is None else f"greedy return {run.greedy_return:.1f}"
     lines = [
         f"{run.env_steps:,} environment steps, {run.cpu_seconds:.2f} CPU-seconds of training, "

@@ -7,7 +7,6 @@ means; `neuralq evaluate RUN --best` plays fresh episodes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ BEST_FOLDER = "best"
 
 @dataclass(frozen=True, slots=True)
 class Best:
-    """The best parameters of a run so far.
+    """Parameters and how they scored.
 
     Args:
         env_steps: environment steps at which they were evaluated.
@@ -40,13 +39,7 @@ class Best:
     normalisation: dict[str, Any] | None = None
 
 
-def keep_best(
-    run_dir: str | Path,
-    env_steps: int,
-    greedy_return: float,
-    parameters: Tensor,
-    normalisation: Mapping[str, Any] | None = None,
-) -> Path:
+def keep_best(run_dir: str | Path, best: Best) -> Path:
     """Keeps these parameters as the best of the run, in one step, in place of those kept before.
 
     Raises:
@@ -55,13 +48,12 @@ def keep_best(
     Example:
         >>> import tempfile
         >>> folder = tempfile.mkdtemp()
-        >>> _ = keep_best(folder, 4096, 31.5, torch.ones(2))
+        >>> _ = keep_best(folder, Best(4096, 31.5, torch.ones(2)))
         >>> load_best(folder).greedy_return
         31.5
     """
-    seen = None if normalisation is None else dict(normalisation)
-    state = {"greedy_return": float(greedy_return), "parameters": parameters, "normalisation": seen}
-    return save(Path(run_dir) / BEST_FOLDER, env_steps, state, keep=1)
+    state = {name: getattr(best, name) for name in ("greedy_return", "parameters", "normalisation")}
+    return save(Path(run_dir) / BEST_FOLDER, best.env_steps, state, keep=1)
 
 
 def load_best(run_dir: str | Path) -> Best:

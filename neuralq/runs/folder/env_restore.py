@@ -64,8 +64,9 @@ def restore_env(env: Any, tree: Mapping[str, Any]) -> None:
         )
     try:
         env.reset(seed=0)
-        _Restorer().restore(env, tree["root"], "env", type(env))
-        where = difference(dict(tree), encode_env(env))
+        saved = _with_present_names(dict(tree))
+        _Restorer().restore(env, saved["root"], "env", type(env))
+        where = difference(saved, encode_env(env))
     except NotCopyable:
         raise
     except Exception as error:  # the environment's own code ran, or the tree was not made by `encode_env`
@@ -74,6 +75,30 @@ def restore_env(env: Any, tree: Mapping[str, Any]) -> None:
         raise NotCopyable(
             f"{where} differs after restoring; was the environment made in the same way as the saved one?"
         )
+
+
+_FORMER_NAMES = {
+    "neuralq.interact.lanes.Lane": "neuralq.runs.stream.vector_env.SubEnv",
+    "neuralq.features.": "neuralq.runs.stream.encoding.",
+    "neuralq.recipes.games.": "neuralq.runs.recipe.games.",
+    "neuralq.mdp.FiniteMDP": "neuralq.mdp.model.FiniteMDP",
+    "neuralq.simulate.Outcomes": "neuralq.mdp.outcomes.Outcomes",
+    "neuralq.simulate.Sampler": "neuralq.mdp.sampler.Sampler",
+    "neuralq.simulate.Model": "neuralq.mdp.environment.Model",
+}
+"""How names of classes and functions began in trees that neuralq 0.3.1 wrote, and how they begin now."""
+
+
+def _with_present_names(node: Any) -> Any:
+    if isinstance(node, list | tuple):
+        return type(node)(map(_with_present_names, node))
+    if isinstance(node, dict):
+        return {key: _with_present_names(value) for key, value in node.items()}
+    if isinstance(node, str) and node.startswith("neuralq."):
+        for former, present in _FORMER_NAMES.items():
+            if node.startswith(former):
+                return present + node.removeprefix(former)
+    return node
 
 
 class _Restorer:

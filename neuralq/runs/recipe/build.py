@@ -23,9 +23,10 @@ from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
 from neuralq.runs.folder.env_probe import is_resumable
-from neuralq.runs.loop import Plan, Session, seed_for
+from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
+from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
@@ -163,7 +164,10 @@ def build_session(config: RunConfig) -> Session:
         np.random.default_rng(seed_for(config.seed, 6)),
     )
     _warm(config, engine, stream)
-    return Session(stream, policy, experience, learner, generators, evaluation, probe)
+    return Session(
+        stream, policy, experience, learner, generators, evaluation, probe,
+        config.seed, config.evaluation_episodes, config.evaluation_max_steps,
+    )  # fmt: skip
 
 
 def engine_name(learner: Learner) -> str:
@@ -271,12 +275,10 @@ def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: Any) -> No
 def plan_of(config: RunConfig) -> Plan:
     """When this run evaluates, saves and stops."""
     return Plan(
-        total_steps=config.total_steps,
-        stop_at_return=config.stop_at_return,
+        budget=config.total_steps,
         evaluate_every=config.evaluate_every,
-        evaluation_episodes=config.evaluation_episodes,
-        evaluation_max_steps=config.evaluation_max_steps,
         checkpoint_every=config.checkpoint_every,
         log_every=config.log_every,
         seed=config.seed,
+        stop_at_return=config.stop_at_return,
     )

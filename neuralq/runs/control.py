@@ -1,0 +1,162 @@
+"""Runs that learn to act in a Gymnasium environment: their result, the agent they leave, and how it is measured."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuralq.checks import check_whole
+from neuralq.q.flat import FlatParameters
+from neuralq.runs.agent import Agent
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.best import load_best
+from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
+from neuralq.runs.kinds import Kind, limited_threads
+from neuralq.runs.loop import Progress, seed_for
+from neuralq.runs.recipe.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
+from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.session import Session
+from neuralq.runs.stream import Interaction
+from neuralq.runs.stream.encoding import discrete_actions
+
+__all__ = ["CONTROL", "Run", "evaluate_run"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """The result of a run on an environment.
+
+    Args:
+        run_dir: its folder.
+        env_steps: environment steps.
+        cpu_seconds: CPU time of training, evaluations excluded.
+        wall_seconds: wall time of training and evaluation.
+        greedy_return: mean return of the last greedy evaluation.
+        parameters_sha256: of the flat parameter vector's bytes.
+        reached: whether ``stop_at_return`` was met; None where none was asked for.
+        interrupted_by: name of the signal that ended it early, or None.
+        resumability: how exactly it can be resumed, in words.
+        engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
+    """
+
+    run_dir: Path
+    env_steps: int
+    cpu_seconds: float
+    wall_seconds: float
+    greedy_return: float | None
+    parameters_sha256: str
+    reached: bool | None
+    interrupted_by: str | None
+    resumability: str
+    engine: str
+
+    @property
+    def trained(self) -> str:
+        """How much training there was, in words."""
+        return f"{self.env_steps:,} environment steps"
+
+    def plain(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        return {**dataclasses.asdict(self), "run_dir": str(self.run_dir)}
+
+    def lines(self) -> list[str]:
+        """The same for people."""
+        score = "not evaluated" if self.greedy_return is None else f"greedy return {self.greedy_return:.1f}"
+        return [
+            f"{self.trained}, {self.cpu_seconds:.2f} CPU-seconds of training, {self.wall_seconds:.2f} seconds in all; "
+            f"{score}"
+        ]
+
+
+def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
+    return Run(
+        run_dir=folder.path,
+        env_steps=session.env_steps,
+        cpu_seconds=progress.cpu_seconds,
+        wall_seconds=progress.wall_seconds,
+        greedy_return=progress.greedy_return,
+        parameters_sha256=session.learner.engine.flat.sha256(),
+        reached=None if config.stop_at_return is None else progress.reached_at is not None,
+        interrupted_by=progress.interrupted_by,
+        resumability=session.resumability.reason,
+        engine=engine_name(session.learner),
+    )
+
+
+def _load_agent(run_dir: str | Path, best: bool) -> Agent:
+    config = config_from_dict(read_config(run_dir))
+    parameters, statistics = _kept(Path(run_dir), best)
+    envs = make_envs(config, 1)
+    try:
+        seen = normalisation_for(config, envs)
+        if seen is not None:
+            seen.load_state_dict(statistics)
+            seen = seen.frozen()
+        stream = Interaction(envs, config.gamma, 0, config.layout == "table", seen)
+        q = build_q(config, stream.spec, np.random.default_rng(0))
+        FlatParameters(q).load(parameters)  # type: ignore[arg-type]
+        _, first_action = discrete_actions(envs.single_action_space)
+        scale = config.reward_scale * (1.0 if seen is None else seen.reward_scale)
+        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen)
+    finally:
+        envs.close()
+
+
+def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
+    """The flat parameters, and the statistics through which observations were seen."""
+    if best:
+        kept = load_best(run_dir)
+        return kept.parameters, kept.normalisation
+    saved = checkpoint.load_newest(run_dir / "checkpoints").state
+    state = saved["learner"]
+    parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
+    if state.get("average") is not None:
+        parameters = state["average"]["values"]
+    return torch.as_tensor(parameters), saved["stream"].get("normalisation")
+
+
+def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool = False) -> Evaluation:
+    """Greedy returns of a run's newest checkpoint, or of its best evaluation, on fresh episodes.
+
+    Args:
+        run_dir: folder of the run.
+        num_episodes: how many episodes.
+        seed: of the episodes; unrelated to those seen in training.
+        best: play with the parameters whose greedy evaluation scored highest, in place of the newest.
+    """
+    check_whole("num_episodes", num_episodes)
+    check_whole("seed", seed, 0)
+    config = config_from_dict(read_config(run_dir))
+    agent = _load_agent(run_dir, best)
+    with limited_threads(config.threads):
+        envs = make_envs(config, min(num_episodes, 64))
+        try:
+            stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
+            with torch.no_grad():
+                return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7))
+        finally:
+            envs.close()
+
+
+CONTROL = Kind(
+    name="control",
+    title="control",
+    config=RunConfig,
+    budget="total_steps",
+    to_plain=config_to_dict,
+    from_plain=config_from_dict,
+    default_path=lambda config: default_run_path(config.env, config.layout, config.seed, datetime.now()),
+    num_threads=lambda config: config.threads,
+    build=lambda config: build_session(config),
+    plan=plan_of,
+    result=_result,
+    load=_load_agent,
+)

@@ -1,0 +1,195 @@
+"""The kinds of runs there are, and what makes a kind: a system that trains is one folder and one line in `KINDS`.
+
+Kinds are named as "module:name", so that nothing here imports what stands above.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import torch
+from threadpoolctl import threadpool_limits
+
+from neuralq.runs.folder.files import RunFolderError
+from neuralq.runs.folder.run_folder import RunFolder, is_run_folder, read_config, refuse_old_run
+from neuralq.runs.loop import Hook, Plan, Progress, Trainee, continued, fit
+
+__all__ = ["KINDS", "Kind", "Result", "kind_in", "kind_named", "kind_of", "limited_threads"]
+
+KINDS = {
+    "control": "neuralq.runs.control:CONTROL",
+    "td-gammon": "neuralq.systems.backgammon.run:TD_GAMMON",
+}
+"""By what ``config.json`` says under ``kind``; where it says nothing, it is control."""
+
+
+class Result(Protocol):
+    """The result of a run."""
+
+    @property
+    def run_dir(self) -> Path:
+        """Its folder."""
+        ...
+
+    @property
+    def interrupted_by(self) -> str | None:
+        """Name of the signal that ended it early, or None."""
+        ...
+
+    def plain(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        ...
+
+    @property
+    def trained(self) -> str:
+        """How much training there was, in words."""
+        ...
+
+    def lines(self) -> list[str]:
+        """The same for people."""
+        ...
+
+
+C = TypeVar("C")
+T = TypeVar("T", bound=Trainee)
+R = TypeVar("R", bound=Result)
+
+
+@dataclass(frozen=True)
+class Kind(Generic[C, T, R]):
+    """All that has to be known of a kind of run.
+
+    Args:
+        name: in `KINDS`.
+        title: for people.
+        config: the dataclass that decides a run.
+        budget: its field that says how much training.
+        to_plain: a configuration as plain values, for JSON.
+        from_plain: the configuration that ``to_plain`` wrote; raises ValueError for what it cannot be.
+        default_path: where a run goes that was given no folder.
+        num_threads: CPU threads for linear algebra.
+        build: what trains, freshly made, with compiled kernels warm.
+        plan: when a run is evaluated, saved and stopped.
+        result: of a run that has ended; may leave files of its own in the folder.
+        load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
+    """
+
+    name: str
+    title: str
+    config: type[C]
+    budget: str
+    to_plain: Callable[[C], dict[str, Any]]
+    from_plain: Callable[[Mapping[str, Any]], C]
+    default_path: Callable[[C], Path]
+    num_threads: Callable[[C], int]
+    build: Callable[[C], T]
+    plan: Callable[[C], Plan]
+    result: Callable[[C, T, Progress, RunFolder], R]
+    load: Callable[[Path, bool], Any]
+
+    def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
+        """Train as configured and leave a run folder: configuration, versions, metrics and checkpoints.
+
+        Raises:
+            ValueError: for settings that do not go together.
+            RunFolderError: if the folder already holds a run.
+            EnvironmentFault: if the environment breaks its contract while training.
+            Diverged: if the parameters stop being finite.
+        """
+        path = self.default_path(config) if run_dir is None else Path(run_dir)
+        refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
+        plain, seed = self.to_plain(config), self.plan(config).seed
+        with limited_threads(self.num_threads(config)), contextlib.closing(self.build(config)) as trainee:
+            with RunFolder.create(path, config=plain, seed=seed) as folder:
+                return self._finish(config, trainee, Progress(), folder, hooks)
+
+    def resume(self, run_dir: str | Path, budget: int | None = None, hooks: Sequence[Hook] = ()) -> R:
+        """Go on with a run from its newest valid checkpoint, or from the start if it was stopped before the first.
+
+        Raises:
+            RunFolderError: if there is no run, or another process is writing it.
+            CheckpointError: if no checkpoint is intact.
+            ValueError: if the run is of another kind.
+        """
+        config = self.from_plain(read_config(run_dir))
+        if budget is not None:
+            config = dataclasses.replace(config, **{self.budget: budget})  # type: ignore[type-var]  # a dataclass
+        with (
+            limited_threads(self.num_threads(config)),
+            RunFolder.open(run_dir) as folder,
+            contextlib.closing(self.build(config)) as trainee,
+        ):
+            progress = continued(trainee, folder)
+            folder.truncate_metrics(trainee.env_steps)
+            if budget is not None:
+                folder.replace_config(self.to_plain(config))
+            return self._finish(config, trainee, progress, folder, hooks)
+
+    def _finish(self, config: C, trainee: T, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]) -> R:
+        plan = self.plan(config)
+        reached = plan.stop_at_return is not None and progress.reached_at is not None
+        if not (progress.finished and (reached or trainee.amount >= plan.budget)):
+            fit(trainee, plan, progress, folder, hooks)
+        result = self.result(config, trainee, progress, folder)
+        folder.write_summary(result.plain())
+        return result
+
+
+@contextlib.contextmanager
+def limited_threads(num_threads: int) -> Iterator[None]:
+    """Within the block linear algebra has so many threads.
+
+    Example:
+        >>> with limited_threads(1):
+        ...     torch.get_num_threads()
+        1
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(num_threads)
+    try:
+        with threadpool_limits(num_threads):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def kind_named(name: str) -> Kind[Any, Any, Any]:
+    """The kind of this name.
+
+    Raises:
+        RunFolderError: if there is none.
+
+    Example:
+        >>> kind_named("control").budget
+        'total_steps'
+    """
+    if name not in KINDS:
+        raise RunFolderError(f"there are runs of the kinds {', '.join(KINDS)}, got {name!r}; upgrade neuralq")
+    module, _, attribute = KINDS[name].partition(":")
+    kind: Kind[Any, Any, Any] = getattr(importlib.import_module(module), attribute)
+    return kind
+
+
+def kind_in(path: str | Path) -> str | None:
+    """The name of the kind of run in a folder; None where there is no run.
+
+    Example:
+        >>> kind_in("/nowhere") is None
+        True
+    """
+    return str(read_config(path).get("kind", "control")) if is_run_folder(path) else None
+
+
+def kind_of(run_dir: str | Path) -> Kind[Any, Any, Any]:
+    """The kind of the run in a folder.
+
+    Raises:
+        RunFolderError: if there is no run in it, or one of no known kind.
+    """
+    return kind_named(str(read_config(run_dir).get("kind", "control")))

@@ -1,0 +1,174 @@
+"""What trains on a Gymnasium environment: a stream of experience, folded through a behaviour, a source and a learner."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuralq.learners.averaging import evaluating_with, evaluation_parameters
+from neuralq.learners.learner import Learner, Update
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.folder.best import Best
+from neuralq.runs.folder.env_encode import encode_env
+from neuralq.runs.folder.env_probe import Resumability
+from neuralq.runs.folder.env_restore import restore_env
+from neuralq.runs.loop import Diverged, seed_for
+from neuralq.runs.stop_request import StopRequest
+from neuralq.runs.stream import Interaction, Policy
+from neuralq.runs.stream.experience import ExperienceSource, Sample
+
+__all__ = ["Session"]
+
+
+@dataclass
+class Session:
+    """The mutable parts of a run on an environment; a `neuralq.runs.loop.Trainee`.
+
+    Args:
+        stream: experience from the training environments.
+        policy: the behaviour.
+        experience: between stream and learner.
+        learner: what learns.
+        generators: every generator in use, by name.
+        evaluation_stream: an interaction with an environment made for evaluation.
+        resumability: whether the environments' state can be saved.
+        seed: of the run.
+        evaluation_episodes: episodes of each evaluation.
+        evaluation_max_steps: bound on an evaluation episode where the environment has none.
+    """
+
+    stream: Interaction
+    policy: Policy
+    experience: ExperienceSource
+    learner: Learner
+    generators: dict[str, np.random.Generator]
+    evaluation_stream: Interaction
+    resumability: Resumability
+    seed: int
+    evaluation_episodes: int
+    evaluation_max_steps: int
+    _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
+    _last: tuple[Update, Sample] | None = field(init=False, default=None)
+    _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
+
+    unit = "env_steps"
+
+    @property
+    def amount(self) -> int:
+        """Environment steps, summed over parallel environments."""
+        return self.stream.num_steps
+
+    @property
+    def env_steps(self) -> int:
+        """The same."""
+        return self.stream.num_steps
+
+    @property
+    def observed(self) -> tuple[Learner, Sample] | None:
+        """The learner and the sample it last learned from."""
+        return None if self._last is None else (self.learner, self._last[1])
+
+    def advance(self, until: int, request: StopRequest) -> None:
+        """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
+        stream, experience, learner = self.stream, self.experience, self.learner
+        device = learner.engine.flat.values.device
+        on_cpu = device.type == "cpu"
+        while True:
+            step = stream.step(self.policy)
+            experience.add(step)
+            for episode in step.episodes:
+                self._recent_returns.append(episode.episode_return)
+            for sample in experience.draw():
+                transition = sample.transition if on_cpu else sample.transition.map(lambda x: x.to(device))
+                # Weights stay on the host: which are 0 is asked there, and learners that multiply by them move them.
+                update = learner.update(transition, sample.weight)
+                experience.return_errors(sample, update.errors)
+                self._last = update, sample
+            if experience.between_samples and (stream.num_steps >= until or request.name is not None):
+                return
+
+    def training_row(self) -> dict[str, Any]:
+        """Mean return of recent episodes, number of updates, and what the last one saw."""
+        recent = float(np.mean(self._recent_returns)) if self._recent_returns else None
+        return {"episode_return": recent, "num_updates": self.learner.num_updates, **self._last_metrics()}
+
+    def _last_metrics(self) -> dict[str, float]:
+        """Of the last update, which may have been before the run was resumed."""
+        return self._metrics_before if self._last is None else self._last[0].metrics()
+
+    def play_greedily(self, seed: int) -> Evaluation:
+        """Greedy episodes with the parameters that the learner plays with."""
+        with evaluating_with(self.learner):
+            return evaluate_greedy(
+                self.learner.engine.all, self.evaluation_stream, self.evaluation_episodes, seed,
+                self.evaluation_max_steps,
+            )  # fmt: skip
+
+    def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
+        """Returns of greedy episodes, and the parameters that played them."""
+        found, seen = self.play_greedily(seed), self.stream.normalisation
+        statistics = None if seen is None else seen.state_dict()
+        columns = {"greedy_return": found.mean, "returns": list(found.returns), "num_cut": found.num_cut}
+        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics)
+
+    def require_finite(self) -> None:
+        """Refuse parameters that are no longer finite.
+
+        Raises:
+            Diverged: if they are not.
+        """
+        if not bool(torch.isfinite(self.learner.engine.flat.values).all()):
+            raise Diverged(
+                f"after {self.env_steps:,} environment steps the parameters are no longer finite: training "
+                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
+                "or λ nearer 1"
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a continued run needs, as one tree."""
+        return {
+            "progress": {
+                "env_steps": self.env_steps,
+                "recent_returns": list(self._recent_returns),
+                "last_metrics": self._last_metrics(),
+            },
+            "learner": self.learner.state_dict(),
+            "feed": self.experience.state_dict(),
+            "stream": self.stream.state_dict(),
+            "environments": encode_env(self.stream.envs) if self.resumability.exact else None,
+            "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`.
+
+        Where the environments' state could not be saved, every environment starts a new episode, with a seed of its
+        own.
+        """
+        progress = state["progress"]
+        self._recent_returns.extend(progress["recent_returns"])
+        self._metrics_before = progress["last_metrics"]
+        self.learner.load_state_dict(state["learner"])
+        self.experience.load_state_dict(state["feed"])
+        for name, rng in self.generators.items():
+            rng.bit_generator.state = state["generators"][name]
+        if state["environments"] is not None:
+            restore_env(self.stream.envs, state["environments"])
+            self.stream.load_state_dict(state["stream"])
+        else:
+            self.stream.load_normalisation(state["stream"])
+            self.stream.restart(seed_for(self.seed, 8, progress["env_steps"]))
+            self.stream.num_steps = progress["env_steps"]
+            self.learner.begin_streams()
+
+    def close(self) -> None:
+        """Close the environments."""
+        for stream in (self.stream, self.evaluation_stream):
+            with contextlib.suppress(Exception):
+                stream.envs.close()
