@@ -126,6 +126,9 @@ def exact(rule: str, epsilon: float) -> Any:
                     own = q[s] - q[s].max()
                     log_pi = own[a] - tau * np.log(np.exp(own / tau).sum())
                     new[s, a] = r + 0.9 * max(log_pi, -1.0) + gamma * soft
+                elif rule == "expected_sarsa":
+                    pi = np.exp((after - after.max()) / 0.2)
+                    new[s, a] = r + gamma * (pi / pi.sum()) @ after
                 else:
                     new[s, a] = r + gamma * ((1 - epsilon) * after.max() + epsilon * after.mean())
         q = new
@@ -152,6 +155,7 @@ def chain_buffer(seed: int, wrong: bool) -> ReplayBuffer:
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "munchausen": {},
+    "expected_sarsa": {"temperature": 0.2},
     "retrace": {"block_length": 4, "lambda_": 0.9, "target_epsilon": 0.1},
     "tree_backup": {"block_length": 4, "lambda_": 0.9, "target_epsilon": 0.1},
     # Safe for λ below (1 − γ) / (γ max ‖π − μ‖₁) = 0.1 / (0.9 · 1.1).
@@ -205,6 +209,7 @@ def replay(layout: str = "action-output", **settings: Any) -> dict[str, Any]:
 C51 = {"distribution": "categorical", "value_min": 0.0, "value_max": 50.0}
 CASES: dict[str, dict[str, Any]] = {
     "munchausen": replay(target_rule="munchausen", target_period_updates=9),
+    "expected sarsa": replay(target_rule="expected_sarsa", num_steps=2),
     "quantile": replay(distribution="quantile", target_rule="double", prioritised=True),
     "munchausen quantile, dueling": replay(distribution="quantile", target_rule="munchausen") | {"dueling": True},
     "categorical, n-step": replay(**C51, num_steps=3),

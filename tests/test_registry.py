@@ -1,7 +1,7 @@
-"""A learner is one file: everything that offers a choice of learners finds it by its record.
+"""A learner is one file, a target rule a function and a record: everything that offers a choice finds them by these.
 
-Mutants that must die here: a list of learners anywhere between the record and the command line · a record that is found
-twice and taken once · a question about the class of the settings in runs/ or lab/.
+Mutants that must die here: a list of learners or rules anywhere between the record and the command line · a record that
+is found twice and taken once · a question about the class of the settings in runs/ or lab/.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import pytest
 
 import neuralq.learners
 from neuralq.learners import LearnerKind, learner_kinds
+from neuralq.rules import target_rules
 from neuralq.rules.records import discovered
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LEARNERS
@@ -122,11 +123,6 @@ NEARSIGHTED = LearnerKind(
 )
 '''
 
-PROGRAM = """
-import sys
-import neuralq.learners
-neuralq.learners.__path__.append(sys.argv[1])
-"""
 COMMANDS = """
 import contextlib, io, json
 from neuralq.apps.cli import main
@@ -139,10 +135,10 @@ print(json.dumps(said))
 """
 
 
-def said_by(folder: Path, program: str, *argv: str) -> str:
-    """What a program of its own says, that knows the learner in the folder."""
-    (folder / "nearsighted.py").write_text(NEARSIGHTED)
-    command = [sys.executable, "-W", "error", "-c", PROGRAM + program, str(folder), *argv]
+def said_by(folder: Path, room: str, program: str, *argv: str) -> str:
+    """What a program of its own says where the files of a folder stand beside those of ``neuralq.{room}``."""
+    script = f"import sys, neuralq.{room}\nneuralq.{room}.__path__.append(sys.argv[1])\n"
+    command = [sys.executable, "-W", "error", "-c", script + program, str(folder), *argv]
     paths = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'envs'}"}
     result = subprocess.run(command, cwd=ROOT, env=paths, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
@@ -150,6 +146,7 @@ def said_by(folder: Path, program: str, *argv: str) -> str:
 
 
 def test_a_learner_in_a_file_of_its_own_is_offered_trains_and_resumes(tmp_path: Path) -> None:
+    (tmp_path / "nearsighted.py").write_text(NEARSIGHTED)
     train = ["train", "CartPole-v1", "--learner", "nearsighted", "--layout", "linear", "--preset", "false"]
     train += ["--evaluation-episodes", "1", "--epsilon-decay-steps", "50", "--nearsighted.step-size", "0.25", "--json"]
     parts, whole = (["--run-dir", str(tmp_path / name)] for name in ("parts", "whole"))
@@ -159,7 +156,7 @@ def test_a_learner_in_a_file_of_its_own_is_offered_trains_and_resumes(tmp_path: 
         ["resume", parts[1], "--total-steps", "120", "--json"],
         [*train, "--total-steps", "120", *whole],
     ]
-    offered, *runs = json.loads(said_by(tmp_path, COMMANDS, json.dumps(commands)))
+    offered, *runs = json.loads(said_by(tmp_path, "learners", COMMANDS, json.dumps(commands)))
     assert "{rollout,replay,online,streaming,gradient,nearsighted}" in offered
     assert "sees no further than the reward: this test" in offered
     assert "--nearsighted.step-size X" in offered and "how far a value moves towards the reward" in offered
@@ -169,6 +166,7 @@ def test_a_learner_in_a_file_of_its_own_is_offered_trains_and_resumes(tmp_path: 
 
 
 def test_a_learner_in_a_file_of_its_own_is_used_from_python(tmp_path: Path) -> None:
+    (tmp_path / "nearsighted.py").write_text(NEARSIGHTED)
     program = """
 import neuralq
 from neuralq.learners.nearsighted import NearsightedSettings
@@ -183,9 +181,77 @@ try:
 except ValueError as error:
     print(error)
 """
-    assert said_by(tmp_path, program).splitlines() == [
+    assert said_by(tmp_path, "learners", program).splitlines() == [
         "40 torch (2,)",
         "0.125",
         "settings for the nearsighted learner would be ignored with learner='rollout'; use learner='nearsighted' or "
         "leave them out",
     ]
+
+
+# A target rule of one's own: a function and a record.
+
+HALFWAY = '''
+"""Between the best action and any: a target rule for a test."""
+
+from neuralq.checks import check_fraction
+from neuralq.rules.policies import epsilon_greedy
+from neuralq.rules.target_rule import Followed, Option, TargetRule
+
+HALFWAY = TargetRule(
+    name="halfway",
+    title="between the best action and any",
+    source="this test",
+    follows=lambda seen: Followed(pi=epsilon_greedy(seen.q_t, seen.options["halfway_share"])),
+    options={"halfway_share": Option(0.5, check_fraction, "how far towards any action", "goes no half ways")},
+)
+'''
+TRIED = """
+import json
+import neuralq
+from neuralq.learners import ReplaySettings
+for distribution in ({}, {"distribution": "quantile"}, {"distribution": "categorical", "value_min": 0, "value_max": 9}):
+    config = neuralq.with_preset({
+        "env": "CartPole-v1", "learner": "replay", "body": {"class": "MLP", "hidden": [8]}, "total_steps": 30,
+        "evaluation_episodes": 1, "replay": {"target_rule": "halfway", "learning_starts": 10, **distribution},
+    })
+    print(config.replay.halfway_share, neuralq.train(config, sys.argv[1] + "/" + str(len(distribution))).env_steps)
+for given in ({"halfway_share": 0.5}, {"target_rule": "halfway", "halfway_share": 2.0}):
+    try:
+        ReplaySettings(**given)
+    except ValueError as error:
+        print(error)
+"""
+
+
+def test_a_target_rule_in_a_file_of_its_own_is_learned_with_every_distribution(tmp_path: Path) -> None:
+    (tmp_path / "halfway.py").write_text(HALFWAY)
+    assert said_by(tmp_path, "rules", TRIED).splitlines() == [
+        *("0.5 30", "0.5 30", "0.5 30"),
+        "halfway_share=0.5 would be ignored: target_rule='q_learning' goes no half ways; leave halfway_share out",
+        "halfway_share must lie in [0, 1], got 2.0",
+    ]
+    train = ["train", "CartPole-v1", "--learner", "replay", "--replay.target-rule", "halfway", "--total-steps", "30"]
+    train += ["--replay.halfway-share", "0.25", "--replay.learning-starts", "10", "--hidden", "8", "--json"]
+    commands = [[*train, "--help"], [*train, "--evaluation-episodes", "1", "--run-dir", str(tmp_path / "run")]]
+    offered, _ = json.loads(said_by(tmp_path, "rules", COMMANDS, json.dumps(commands)))
+    assert "how far towards any action" in offered and '"halfway" (this test)' in offered
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["replay"]["halfway_share"] == 0.25
+
+
+def test_a_rule_says_what_it_follows_or_refuses_distributions() -> None:
+    rule = target_rules()["watkins"]
+    with pytest.raises(ValueError, match="'watkins' must refuse distributions, or say what it follows"):
+        dataclasses.replace(rule, refuses={})
+    with pytest.raises(ValueError, match="'watkins' says neither what it follows nor what its mean is"):
+        dataclasses.replace(rule, mean=None)
+
+
+@pytest.mark.parametrize("room", ["learners", "runs", "lab"])
+def test_nobody_compares_the_name_of_a_target_rule(room: str) -> None:
+    offences = []
+    for path in (ROOT / "neuralq" / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Compare) and "target_rule" in {getattr(x, "attr", "") for x in ast.walk(node)}:
+                offences.append(f"{path.relative_to(ROOT)}: {ast.unparse(node)}")
+    assert not offences

@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 from neuralq.checks import check_positive
-from neuralq.rules.target_rule import Followed, Option, TargetRule
+from neuralq.rules.policies import softmax
+from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule
 from neuralq.rules.targets import double_q, q_learning
 
-__all__ = ["DOUBLE", "DQRC", "Q_LEARNING", "TEMPERATURE"]
+__all__ = ["DOUBLE", "DQRC", "EXPECTED_SARSA", "Q_LEARNING", "TEMPERATURE", "policy_average"]
 
 TEMPERATURE = Option(
     0.03, check_positive, "τ of the policy softmax(q/τ), in units of scaled rewards", "has no softmax policy"
 )
 """The option of every rule that follows a softmax policy."""
+
+
+def policy_average(seen: Seen) -> Followed:
+    """Expected Sarsa follows the policy softmax(q/τ) of the frozen values.
+
+    With τ → 0 it is Q-learning, with τ → ∞ the policy that draws any legal action. The average leaves out the variance
+    of the drawn action that Sarsa's target has.
+
+    Source: van Seijen, van Hasselt, Whiteson, Wiering 2009, eq. 5, with a softmax policy.
+
+    Example:
+        >>> import torch
+        >>> from neuralq.types import Transition
+        >>> row = torch.tensor
+        >>> step = Transition(row([0]), row([0]), row([1.0]), row([1.0]), row([0.5]), row([1]), row([False]))
+        >>> seen = Seen(step, lambda s, target: row([[0.0, 1.0, -torch.inf]]), options={"temperature": 1.0})
+        >>> EXPECTED_SARSA.target(seen)  # 1 + ½ e/(1 + e)
+        tensor([1.3655])
+    """
+    return Followed(pi=softmax(seen.q_t, seen.options["temperature"]))
 
 
 def _not_negative(name: str, value: float) -> None:
@@ -36,6 +57,14 @@ DOUBLE = TargetRule(
     follows=lambda seen: Followed(a=seen.online_t.argmax(-1)),
     mean=lambda seen: double_q(seen.r_t, seen.discount_t, seen.q_t, seen.online_t),
     place=2,
+)
+EXPECTED_SARSA = TargetRule(
+    name="expected_sarsa",
+    title="expected Sarsa: the average by a softmax policy",
+    source="van Seijen, van Hasselt, Whiteson & Wiering 2009",
+    follows=policy_average,
+    options={"temperature": TEMPERATURE},
+    place=3,
 )
 DQRC = TargetRule(
     name="dqrc",

@@ -8,6 +8,7 @@ from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead, ha
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.engine import Loss, TorchEngine
+from neuralq.rules.one_step import DOUBLE
 
 __all__ = ["REPLAY"]
 
@@ -53,7 +54,7 @@ REPLAY = LearnerKind(
         lambda_=0.0 if s.block_length == 1 else s.lambda_,
         target_period=s.target_period_updates,
         replay=True,
-        double=s.target_rule == "double",
+        double=s.rule is DOUBLE,
     ),
     loss=lambda s: Loss("huber" if s.loss == "huber" else "squared"),
     outputs=lambda s, layout: s.returns.outputs(s, layout),
