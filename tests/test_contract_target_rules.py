@@ -10,12 +10,12 @@ Mutants that must die here: double, Munchausen or both ignored under quantiles, 
 mean · double that chooses by the target network, believes the online one, or has them the wrong way round · Munchausen
 without its bonus, its entropy or its own numbers, or by the online network · Peng's λ-returns for Watkins', and the
 reverse · each of retrace, tree backup and Harutyunyan's by each other, all by Watkins', with the maximum, or by the
-online network · time limits ignored by λ-returns, or one step in their place · compiled arrays that know Q-learning
-only · targets that are right, and an update that learns from others · rewards left unscaled · DQRC with a target
-network, without its correction, its pull to 0 or its second function, or made a Q-learning run · each refusal let
-through, a learned pair refused, a refusal in two lines, without a way out, or with one that leads back · a learner that
-takes the settings of another · "torch" or "compiled" asked for and the other used · a rule, a distribution or an engine
-added without a formula.
+online network · time limits ignored by λ-returns, or one step in their place · expected Sarsa by the best action, by
+the online network, or with its quantiles averaged · compiled arrays that know Q-learning only · targets that are right,
+and an update that learns from others · rewards left unscaled · DQRC with a target network, without its correction, its
+pull to 0 or its second function, or made a Q-learning run · each refusal let through, a learned pair refused, a refusal
+in two lines, without a way out, or with one that leads back · a learner that takes the settings of another · "torch" or
+"compiled" asked for and the other used · a rule, a distribution or an engine added without a formula.
 """
 
 from __future__ import annotations
@@ -214,6 +214,8 @@ def followed(rule: str, seen: Seen, row: Row) -> tuple[Any, float, float]:
         pi = soft(seen.target_t[row])
         bonus = ALPHA * max(TAU * np.log(soft(seen.target_tm1[row])[seen.a[row]]), FLOOR)
         return pi, bonus, -TAU * sum(p * np.log(p) for p in pi if p > 0)
+    if rule == "expected_sarsa":  # van Seijen, van Hasselt, Whiteson & Wiering 2009, eq. 5
+        return soft(seen.target_t[row]), 0.0, 0.0
     # Mnih et al. 2015 choose by the target network, van Hasselt, Guez & Silver 2016 by the online one.
     chooser = {"q_learning": seen.target_t, "double": seen.online_t, "dqrc": seen.online_t}[rule]
     return greedy(chooser[row]), 0.0, 0.0
@@ -232,11 +234,22 @@ def moved_quantiles(rule: str, seen: Seen, row: Row) -> Any:
     return seen.r[row] + bonus + seen.discount[row] * (average(pi, seen.atoms_t[row]) + entropy)
 
 
+def drawn(rule: str, seen: Seen, row: Row) -> Any:
+    """How likely each action is to follow; where nothing is legal the world has ended, and any will do."""
+    pi, _, _ = followed(rule, seen, row)
+    return pi if pi.any() else np.eye(len(pi))[0]
+
+
+def drawn_quantiles(rule: str, seen: Seen, row: Row) -> Any:
+    """A policy that draws its action has the mixture for its return: the values of every action, as likely as it is."""
+    return seen.r[row] + seen.discount[row] * seen.atoms_t[row].reshape(-1)
+
+
 def moved_categories(rule: str, seen: Seen, row: Row) -> Any:
     """Bellemare, Dabney & Munos 2017, algorithm 1."""
-    pi, bonus, _ = followed(rule, seen, row)
-    a = int(pi.argmax())  # 0 where nothing is legal: the world has ended, and all of the mass moves to the reward
-    mass = np.exp(seen.atoms_t[row][a]) / np.exp(seen.atoms_t[row][a]).sum()
+    _, bonus, _ = followed(rule, seen, row)
+    each = np.exp(seen.atoms_t[row]) / np.exp(seen.atoms_t[row]).sum(-1, keepdims=True)
+    mass = drawn(rule, seen, row) @ each
     low, high = float(GRID[0]), float(GRID[-1])
     share = np.zeros(NUM_ATOMS)
     for p, z in zip(mass, GRID.tolist(), strict=True):
@@ -291,6 +304,7 @@ CORRECTED = {**BLOCKS, "target_epsilon": EPSILON}
 RULES: dict[str, dict[str, Any]] = {
     "q_learning": {},
     "double": {},
+    "expected_sarsa": {"temperature": TAU},
     "munchausen": {"temperature": TAU, "munchausen_alpha": ALPHA, "munchausen_floor": FLOOR},
     "peng": BLOCKS,
     "watkins": BLOCKS,
@@ -306,11 +320,12 @@ DISTRIBUTION_SETTINGS: dict[str, dict[str, Any]] = {
     "categorical": {"num_atoms": NUM_ATOMS, **LIMITS},
 }
 FORMULAS: dict[tuple[str, str], Callable[[str, Seen, Row], Any]] = {
-    **{(rule, "none"): one_step for rule in ("q_learning", "double", "munchausen", "dqrc")},
+    **{(rule, "none"): one_step for rule in ("q_learning", "double", "expected_sarsa", "munchausen", "dqrc")},
     **{(rule, "none"): lambda_return for rule in ("peng", "watkins")},
     **{(rule, "none"): corrected_return for rule in ("retrace", "tree_backup", "harutyunyan")},
     **{(rule, "quantile"): moved_quantiles for rule in ("q_learning", "double", "munchausen")},
-    **{(rule, "categorical"): moved_categories for rule in ("q_learning", "double")},
+    ("expected_sarsa", "quantile"): drawn_quantiles,
+    **{(rule, "categorical"): moved_categories for rule in ("q_learning", "double", "expected_sarsa")},
 }
 
 
@@ -394,7 +409,15 @@ def expected_targets(cell: Cell, seen: Seen) -> Tensor:
     return torch.from_numpy(np.array([formula(cell.rule, seen, row) for row in np.ndindex(T, B)]))
 
 
-def loss(distribution: str, numbers: Tensor, targets: Tensor) -> Tensor:
+def chances(cell: Cell, seen: Seen, targets: Tensor) -> Tensor:
+    """How likely each target value of every row is, where there are several."""
+    if FORMULAS[cell.rule, cell.distribution] is not drawn_quantiles:
+        return torch.full_like(targets, 1 / targets.shape[-1])
+    each = [np.repeat(drawn(cell.rule, seen, row) / NUM_ATOMS, NUM_ATOMS) for row in np.ndindex(T, B)]
+    return torch.from_numpy(np.array(each))
+
+
+def loss(distribution: str, numbers: Tensor, targets: Tensor, likely: Tensor) -> Tensor:
     """Of every row, from its K numbers ``[N, K]``."""
     if distribution == "none":
         return 0.5 * (targets - numbers[:, 0]) ** 2
@@ -403,16 +426,16 @@ def loss(distribution: str, numbers: Tensor, targets: Tensor) -> Tensor:
     error = targets[:, None, :] - numbers[:, :, None]  # Dabney et al. 2018, eq. 10, with κ = 1
     levels = torch.tensor([(2 * i + 1) / (2 * NUM_ATOMS) for i in range(NUM_ATOMS)], dtype=error.dtype)[:, None]
     huber = torch.where(error.abs() <= 1, 0.5 * error**2, error.abs() - 0.5)
-    return ((levels - (error < 0).double()).abs() * huber).mean(-1).sum(-1)
+    return ((levels - (error < 0).double()).abs() * huber * likely[:, None, :]).sum(-1).sum(-1)
 
 
-def expected_step(cell: Cell, before: Learning, targets: Tensor) -> list[Tensor]:
+def expected_step(cell: Cell, before: Learning, targets: Tensor, likely: Tensor) -> list[Tensor]:
     """The parameters after one step of SGD, and after them those of DQRC's second function."""
     t = block(cell.world).map(lambda x: x.flatten(0, 1))
     theta, every = before.online.clone().requires_grad_(), torch.arange(T * B)
     numbers = numbers_of(cell.world, theta, t.s_tm1)[every, t.a_tm1]
     if before.second is None:
-        each = loss(cell.distribution, numbers, targets)
+        each = loss(cell.distribution, numbers, targets, likely)
         return [before.online - RATE * torch.autograd.grad(each.mean(), theta)[0]]
     # Patterson et al. 2022: δ ∇Q − h γ ∇max Q' for the values, (δ − h) ∇h and a pull to 0 for h.
     second = before.second.clone().requires_grad_()
@@ -436,17 +459,20 @@ def check_learned(cell: Cell) -> None:
         pytest.fail(f"teach this test the rule {cell.rule!r} under distribution={cell.distribution!r}: a formula")
     before, t = learning_of(cell), rows_for(cell)
     learner = before.learner
-    wanted = expected_targets(cell, seen_through(cell, before.online, before.target))
+    seen = seen_through(cell, before.online, before.target)
+    wanted = expected_targets(cell, seen)
+    likely = chances(cell, seen, wanted)
     near = {"rtol": 0.0, "atol": EXACT[cell.world]}
     if cell.rule != "dqrc":  # its targets are only to be seen in an update
         got = learner.targets(t).double()
         assert got.shape == (*t.r_t.shape, *wanted.shape[1:])
         torch.testing.assert_close(got.reshape(wanted.shape), wanted, **near)
-    aims = wanted if wanted.ndim == 1 else wanted.mean(-1) if cell.distribution == "quantile" else wanted @ GRID
+    several = wanted @ GRID if cell.distribution == "categorical" else (wanted * likely).sum(-1)
+    aims = wanted if wanted.ndim == 1 else several
     update = learner.update(t)
     torch.testing.assert_close(update.targets.double(), aims, **near)
     after = [learner.engine.flat.values] + ([] if before.second is None else [learner.state_dict()["h"]])
-    for got, values in zip(after, expected_step(cell, before, wanted), strict=True):
+    for got, values in zip(after, expected_step(cell, before, wanted, likely), strict=True):
         torch.testing.assert_close(got.double(), values, **near)
 
 
