@@ -14,8 +14,8 @@ import pytest
 
 from neuralq.mdp import FiniteMDP
 from neuralq_envs import boyan, maximization_bias, random_walk
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.graphs import GraphScene
+from neuralq_envs.rendering import RenderedEnv
 
 
 def values(model: FiniteMDP) -> np.ndarray:
@@ -116,7 +116,7 @@ def test_copies_draw_their_own_noise() -> None:
 
 def test_an_illegal_action_pays_nothing_not_even_noise() -> None:
     scene = GraphScene(("A", "B", "END"), ((0, 0), (0, 1), (0, 2)))
-    env = DrawnEnv(maximization_bias.mdp(num_actions=3), scene, None, np.ones((3, 3)))
+    env = RenderedEnv(maximization_bias.mdp(num_actions=3), scene, None, np.ones((3, 3)))
     env.reset(seed=0)
     assert env.step(2)[:2] == (0, 0.0) and env.step(maximization_bias.LEFT)[1] != 0
 
@@ -125,7 +125,7 @@ def test_noise_must_fit_the_model() -> None:
     scene = GraphScene(("A",) * 13, tuple((0, s) for s in range(13)))
     for wrong in (np.zeros(13), np.full((13, 1), -1.0), np.full((13, 1), np.nan)):
         with pytest.raises(ValueError, match=r"reward_noise must be \(13, 1\) numbers"):
-            DrawnEnv(boyan.mdp(), scene, None, wrong)
+            RenderedEnv(boyan.mdp(), scene, None, wrong)
     with pytest.raises(ValueError, match="each of the 2 states needs a place"):
         GraphScene(("A", "B"), ((0, 0),))
 

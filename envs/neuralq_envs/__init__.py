@@ -21,7 +21,7 @@ class Registration(NamedTuple):
     """A module with `make` (and `make_vector`), and the arguments that make this environment of it.
 
     Args:
-        module: where the functions are; imported when the environment is first made.
+        module: where the functions are (`neuralq_envs.rendering.factories` makes them); imported when first needed.
         kwargs: arguments of both functions.
         has_vector: whether there is a `make_vector`; a world that changes with time is not one model to simulate.
     """

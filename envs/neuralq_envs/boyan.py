@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.graphs import GraphScene
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "NUM_STATES", "features", "make", "make_vector", "mdp"]
 
@@ -56,28 +55,13 @@ def features() -> NDArray[np.float64]:
     return weights
 
 
-def make(render_mode: str | None = None) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/BoyanChain-v0")`` calls.
-
-    Example:
-        >>> make().reset(seed=0)[0]
-        12
-    """
-    jumps = [(s, s - jump) for s in range(1, NUM_STATES) for jump in (1, 2) if s >= jump]
-    scene = GraphScene(
+def _scene() -> GraphScene:
+    return GraphScene(
         labels=tuple(map(str, range(NUM_STATES))),
         places=tuple((0, _START - s) for s in range(NUM_STATES)),
-        edges=tuple(jumps),
+        edges=tuple((s, s - jump) for s in range(1, NUM_STATES) for jump in (1, 2) if s >= jump),
         ends=(0,),
     )
-    return DrawnEnv(mdp(), scene, render_mode)
 
 
-def make_vector(num_envs: int = 1, max_episode_steps: int | None = None) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [12, 12]
-    """
-    return mdp().as_vector_env(num_envs, max_episode_steps=max_episode_steps)
+make, make_vector = factories(mdp, _scene)

@@ -17,8 +17,8 @@ import gymnasium
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import RenderedEnv
 
 __all__ = ["GAMMA", "ChangingEnv", "grids", "make", "mdp"]
 
@@ -76,7 +76,7 @@ class ChangingEnv(gymnasium.Env[Any, Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
 
-    def __init__(self, before: DrawnEnv, after: DrawnEnv, change_step: int) -> None:
+    def __init__(self, before: RenderedEnv, after: RenderedEnv, change_step: int) -> None:
         check_whole("change_step", change_step, minimum=0)
         for name in ("observation_space", "action_space", "render_mode"):
             if getattr(before, name) != getattr(after, name):
@@ -117,7 +117,7 @@ class ChangingEnv(gymnasium.Env[Any, Any]):
         return self._current.render()
 
     @property
-    def _current(self) -> DrawnEnv:
+    def _current(self) -> RenderedEnv:
         return self._after if self._clock_steps >= self._change_step else self._before
 
 

@@ -6,9 +6,8 @@ The shortest way along the edge takes 13 steps: the optimal return is −13 (γ 
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "GRID", "make", "make_vector", "mdp"]
 
@@ -32,26 +31,11 @@ def mdp() -> FiniteMDP:
     Example:
         >>> mdp().num_states, mdp().num_rows
         (48, 148)
-    """
-    return GRID.mdp()
-
-
-def make(render_mode: str | None = None) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/CliffWalking-v0")`` calls.
-
-    Example:
         >>> env = make()
         >>> env.reset(seed=0)[0], env.step(1)[:3]  # east of the start is the cliff
         (36, (36, -100.0, False))
     """
-    return GRID.env(render_mode)
+    return GRID.mdp()
 
 
-def make_vector(num_envs: int = 1, max_episode_steps: int | None = None) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [36, 36]
-    """
-    return GRID.vector_env(num_envs, max_episode_steps)
+make, make_vector = factories(mdp, lambda: GRID)

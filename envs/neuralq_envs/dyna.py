@@ -7,9 +7,8 @@ cells other than G take 404 steps together.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "grid", "make", "make_vector", "mdp"]
 
@@ -45,21 +44,4 @@ def mdp(random_start: bool = False) -> FiniteMDP:
     return grid(random_start).mdp()
 
 
-def make(random_start: bool = False, render_mode: str | None = None) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/DynaMaze-v0")`` calls.
-
-    Example:
-        >>> make().reset(seed=0)[0]
-        18
-    """
-    return grid(random_start).env(render_mode)
-
-
-def make_vector(num_envs: int = 1, random_start: bool = False, max_episode_steps: int | None = None) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [18, 18]
-    """
-    return grid(random_start).vector_env(num_envs, max_episode_steps)
+make, make_vector = factories(mdp, grid)

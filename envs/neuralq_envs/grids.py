@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_fraction, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.canvas import BLUE, CELL, GREEN, GREY, INK, RED, blank, disk, frame, write
-from neuralq_envs.drawn import DrawnEnv
+from neuralq_envs.rendering import RenderedEnv
 
 __all__ = ["ACTIONS", "Grid"]
 
@@ -144,23 +143,14 @@ class Grid:
             action_names=ACTIONS[: self.num_moves],
         )
 
-    def env(self, render_mode: str | None = None) -> DrawnEnv:
+    def env(self, render_mode: str | None = None) -> RenderedEnv:
         """The grid as an environment.
 
         Example:
             >>> Grid("S.G").env().reset(seed=0)[0]
             0
         """
-        return DrawnEnv(self.mdp(), self, render_mode)
-
-    def vector_env(self, num_envs: int, max_episode_steps: int | None = None) -> ModelVectorEnv:
-        """Many copies of the grid, stepped by array operations.
-
-        Example:
-            >>> Grid("S.G").vector_env(2).reset(seed=0)[0].tolist()
-            [0, 0]
-        """
-        return self.mdp().as_vector_env(num_envs, max_episode_steps=max_episode_steps)
+        return RenderedEnv(self.mdp(), self, render_mode)
 
     def _actions(self, s: int) -> list[int]:
         if self.signs[s] not in ".Sx":

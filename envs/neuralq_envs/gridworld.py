@@ -6,12 +6,11 @@ The default map is the 4 x 3 world of Russell & Norvig (Artificial Intelligence:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import factories
 
 __all__ = ["LAYOUT", "make", "make_vector", "mdp"]
 
@@ -28,52 +27,12 @@ def mdp(grid: Grid | None = None) -> FiniteMDP:
     Example:
         >>> mdp(Grid("S..\n.#G", slip=0.1)).num_states
         6
-    """
-    return (Grid(LAYOUT) if grid is None else grid).mdp()
-
-
-def make(
-    layout: str = LAYOUT,
-    step_reward: float = 0.0,
-    goal_reward: float = 1.0,
-    trap_reward: float = -1.0,
-    cliff_reward: float = -1.0,
-    wind: Sequence[int] = (),
-    slip: float = 0.0,
-    num_moves: int = 4,
-    blocked: str = "legal",
-    render_mode: str | None = None,
-) -> DrawnEnv:
-    r"""What ``gymnasium.make("neuralq/Gridworld-v0")`` calls: every parameter of `Grid` is one of the environment.
-
-    Example:
-        >>> import gymnasium
+        >>> import gymnasium  # every parameter of `Grid` is one of the environment
         >>> gymnasium.make("neuralq/Gridworld-v0", layout="S....\n.##.G", slip=0.2).observation_space
         Discrete(10)
     """
-    rewards = (step_reward, goal_reward, trap_reward, cliff_reward)
-    return Grid(layout, *rewards, tuple(wind), slip, num_moves, blocked).env(render_mode)
+    return (_grid() if grid is None else grid).mdp()
 
 
-def make_vector(
-    num_envs: int = 1,
-    layout: str = LAYOUT,
-    step_reward: float = 0.0,
-    goal_reward: float = 1.0,
-    trap_reward: float = -1.0,
-    cliff_reward: float = -1.0,
-    wind: Sequence[int] = (),
-    slip: float = 0.0,
-    num_moves: int = 4,
-    blocked: str = "legal",
-    max_episode_steps: int | None = None,
-) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [8, 8]
-    """
-    rewards = (step_reward, goal_reward, trap_reward, cliff_reward)
-    grid = Grid(layout, *rewards, tuple(wind), slip, num_moves, blocked)
-    return grid.vector_env(num_envs, max_episode_steps)
+_grid = partial(Grid, layout=LAYOUT)
+make, make_vector = factories(lambda **parameters: _grid(**parameters).mdp(), _grid, _grid)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq_envs.drawn import DrawnEnv, NoisyRewards
 from neuralq_envs.graphs import GraphScene
+from neuralq_envs.rendering import NoisyRewards, RenderedEnv
 
 __all__ = ["GAMMA", "LEFT", "RIGHT", "make", "make_vector", "mdp"]
 
@@ -57,7 +57,7 @@ def mdp(num_actions: int = 10, mean: float = -0.1) -> FiniteMDP:
 
 def make(
     num_actions: int = 10, mean: float = -0.1, standard_deviation: float = 1.0, render_mode: str | None = None
-) -> DrawnEnv:
+) -> RenderedEnv:
     """What ``gymnasium.make("neuralq/MaximizationBias-v0")`` calls.
 
     Example:
@@ -67,7 +67,7 @@ def make(
     """
     scene = GraphScene(("A", "B", "END"), ((0, 1), (0, 0), (0, 2)), ((0, 1), (0, 2), (1, 2)), (2,))
     model = mdp(num_actions, mean)
-    return DrawnEnv(model, scene, render_mode, _noise(model, standard_deviation))
+    return RenderedEnv(model, scene, render_mode, _noise(model, standard_deviation))
 
 
 def make_vector(

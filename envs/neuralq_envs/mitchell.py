@@ -13,10 +13,9 @@ cell other than G.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import ACTIONS as _ALL_ACTIONS
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import factories
 
 __all__ = [
     "ACTIONS",
@@ -68,23 +67,4 @@ def mdp(goal: int = GOAL, goal_reward: float = GOAL_REWARD) -> FiniteMDP:
     return grid(goal, goal_reward).mdp()
 
 
-def make(goal: int = GOAL, goal_reward: float = GOAL_REWARD, render_mode: str | None = None) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/MitchellGrid-v0")`` and ``"neuralq/ExerciseGrid-v0"`` call.
-
-    Example:
-        >>> make().action_space
-        Discrete(4)
-    """
-    return grid(goal, goal_reward).env(render_mode)
-
-
-def make_vector(
-    num_envs: int = 1, goal: int = GOAL, goal_reward: float = GOAL_REWARD, max_episode_steps: int | None = None
-) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``: array operations, autoreset disabled.
-
-    Example:
-        >>> make_vector(num_envs=5).reset(seed=0)[0].shape
-        (5,)
-    """
-    return grid(goal, goal_reward).vector_env(num_envs, max_episode_steps)
+make, make_vector = factories(mdp, grid)

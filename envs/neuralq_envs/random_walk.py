@@ -11,9 +11,8 @@ from __future__ import annotations
 
 from neuralq.checks import check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.graphs import GraphScene
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "make", "make_vector", "mdp"]
 
@@ -49,42 +48,19 @@ def mdp(num_states: int = 5, left_reward: float = 0.0, right_reward: float = 1.0
     )
 
 
-def make(
-    num_states: int = 5, left_reward: float = 0.0, right_reward: float = 1.0, render_mode: str | None = None
-) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/RandomWalk-v0")`` and ``"neuralq/RandomWalk19-v0"`` call.
-
-    Example:
-        >>> make(num_states=19).reset(seed=0)[0]
-        10
-    """
+def _scene(num_states: int = 5, **_: float) -> GraphScene:
     size = num_states + 2
-    scene = GraphScene(
+    return GraphScene(
         labels=("END", *_labels(num_states), "END"),
         places=tuple((0, s) for s in range(size)),
         edges=tuple((s, s + 1) for s in range(size - 1)),
         ends=(0, size - 1),
     )
-    return DrawnEnv(mdp(num_states, left_reward, right_reward), scene, render_mode)
-
-
-def make_vector(
-    num_envs: int = 1,
-    num_states: int = 5,
-    left_reward: float = 0.0,
-    right_reward: float = 1.0,
-    max_episode_steps: int | None = None,
-) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [3, 3]
-    """
-    model = mdp(num_states, left_reward, right_reward)
-    return model.as_vector_env(num_envs, max_episode_steps=max_episode_steps)
 
 
 def _labels(num_states: int) -> list[str]:
     """Letters as in the literature, numbers where the alphabet is too short."""
     return [chr(ord("A") + i) if num_states <= 26 else str(i + 1) for i in range(num_states)]
+
+
+make, make_vector = factories(mdp, _scene)

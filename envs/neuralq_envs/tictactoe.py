@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
 from neuralq_envs.canvas import BLUE, CELL, GREY, INK, PAPER, blank, disk, frame, stroke, write
-from neuralq_envs.drawn import DrawnEnv
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "OPPONENTS", "BoardScene", "make", "make_vector", "mdp", "minimax_values", "positions"]
 
@@ -87,6 +86,9 @@ def mdp(
     Example:
         >>> mdp().num_states, mdp().num_actions
         (5478, 9)
+        >>> env = make(opponent="random", player="O")
+        >>> int(env.reset(seed=0)[1]["action_mask"].sum())  # X has moved
+        8
     """
     check_choice("opponent", opponent, OPPONENTS)
     check_choice("player", player, ("X", "O"))
@@ -154,41 +156,7 @@ class BoardScene:
         return picture
 
 
-def make(
-    opponent: str = "forced",
-    player: str = "X",
-    win_reward: float = 1.0,
-    draw_reward: float = 0.0,
-    loss_reward: float = -1.0,
-    render_mode: str | None = None,
-) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/TicTacToe-v0")`` calls.
-
-    Example:
-        >>> env = make(opponent="random", player="O")
-        >>> int(env.reset(seed=0)[1]["action_mask"].sum())  # X has moved
-        8
-    """
-    return DrawnEnv(mdp(opponent, player, win_reward, draw_reward, loss_reward), BoardScene(), render_mode)
-
-
-def make_vector(
-    num_envs: int = 1,
-    opponent: str = "forced",
-    player: str = "X",
-    win_reward: float = 1.0,
-    draw_reward: float = 0.0,
-    loss_reward: float = -1.0,
-    max_episode_steps: int | None = None,
-) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [0, 0]
-    """
-    model = mdp(opponent, player, win_reward, draw_reward, loss_reward)
-    return model.as_vector_env(num_envs, max_episode_steps=max_episode_steps)
+make, make_vector = factories(mdp, lambda **_: BoardScene())
 
 
 @functools.cache

@@ -7,9 +7,8 @@ steps, with the eight moves of a king 7.
 from __future__ import annotations
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.environment import ModelVectorEnv
-from neuralq_envs.drawn import DrawnEnv
 from neuralq_envs.grids import Grid
+from neuralq_envs.rendering import factories
 
 __all__ = ["GAMMA", "WIND", "grid", "make", "make_vector", "mdp"]
 
@@ -37,25 +36,10 @@ def mdp(num_moves: int = 4) -> FiniteMDP:
     Example:
         >>> mdp().num_rows  # 69 cells other than G, four moves each
         276
+        >>> make(num_moves=8).action_space
+        Discrete(8)
     """
     return grid(num_moves).mdp()
 
 
-def make(num_moves: int = 4, render_mode: str | None = None) -> DrawnEnv:
-    """What ``gymnasium.make("neuralq/WindyGridworld-v0")`` calls.
-
-    Example:
-        >>> make(num_moves=8).action_space
-        Discrete(8)
-    """
-    return grid(num_moves).env(render_mode)
-
-
-def make_vector(num_envs: int = 1, num_moves: int = 4, max_episode_steps: int | None = None) -> ModelVectorEnv:
-    """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``.
-
-    Example:
-        >>> make_vector(num_envs=2).reset(seed=0)[0].tolist()
-        [30, 30]
-    """
-    return grid(num_moves).vector_env(num_envs, max_episode_steps)
+make, make_vector = factories(mdp, grid)

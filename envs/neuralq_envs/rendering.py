@@ -1,7 +1,9 @@
-"""A finite model with a picture: the one environment class behind all problems of this package."""
+"""A finite model with a picture: the one environment class behind all problems of this package, and how it is made."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import gymnasium
@@ -11,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice
 from neuralq.mdp import FiniteMDP
+from neuralq.mdp.environment import ModelVectorEnv
 
-__all__ = ["DrawnEnv", "NoisyRewards", "Scene"]
+__all__ = ["NoisyRewards", "RenderedEnv", "Scene", "factories"]
 
 
 class Scene(Protocol):
@@ -25,7 +28,7 @@ class Scene(Protocol):
         """The scene as a picture, ``[H, W, 3]``."""
 
 
-class DrawnEnv(gymnasium.Env[Any, Any]):
+class RenderedEnv(gymnasium.Env[Any, Any]):
     """A finite model as an environment that can be looked at; ``info["action_mask"]`` names the legal actions.
 
     Args:
@@ -40,7 +43,7 @@ class DrawnEnv(gymnasium.Env[Any, Any]):
 
     Example:
         >>> from neuralq_envs import cliff
-        >>> env = DrawnEnv(cliff.mdp(), cliff.GRID, "ansi")
+        >>> env = RenderedEnv(cliff.mdp(), cliff.GRID, "ansi")
         >>> env.reset(seed=0)[1]["action_mask"].tolist()
         [1, 1, 1, 1]
         >>> env.render().splitlines()[-1]
@@ -130,6 +133,44 @@ class NoisyRewards(gymnasium.vector.VectorWrapper):
         # One draw per copy and step, so that what a copy draws does not depend on where the others are.
         reward = reward + spread * self.env.np_random.standard_normal(self.num_envs)
         return s, reward, terminations, truncations, extra
+
+
+def factories(
+    mdp: Callable[..., FiniteMDP], scene: Callable[..., Scene], parameters: Callable[..., Any] | None = None
+) -> tuple[Callable[..., RenderedEnv], Callable[..., ModelVectorEnv]]:
+    """What ``gymnasium.make`` and ``gymnasium.make_vec`` call for a problem: its ``make`` and ``make_vector``.
+
+    Both take the arguments of ``mdp`` by name. ``make`` takes ``render_mode`` too; ``make_vector`` (array operations,
+    autoreset disabled) ``num_envs`` and ``max_episode_steps``.
+
+    Args:
+        mdp: makes the exact model.
+        scene: makes its picture from the same arguments.
+        parameters: whose parameters these are; default ``mdp``.
+
+    Example:
+        >>> from neuralq_envs import cliff
+        >>> make, make_vector = factories(cliff.mdp, lambda: cliff.GRID)
+        >>> make("ansi").reset(seed=0)[0], make_vector(2).reset(seed=0)[0].tolist()
+        (36, [36, 36])
+    """
+
+    def make(render_mode: str | None = None, **given: Any) -> RenderedEnv:
+        """What ``gymnasium.make`` calls: the problem with its picture."""
+        return RenderedEnv(mdp(**given), scene(**given), render_mode)
+
+    def make_vector(num_envs: int = 1, max_episode_steps: int | None = None, **given: Any) -> ModelVectorEnv:
+        """What ``gymnasium.make_vec`` calls in mode ``"vector_entry_point"``."""
+        return mdp(**given).as_vector_env(num_envs, max_episode_steps=max_episode_steps)
+
+    known = inspect.signature(mdp if parameters is None else parameters).parameters.values()
+    named = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in known]
+    made: tuple[Any, Any] = (make, make_vector)
+    for function in made:
+        signature = inspect.signature(function)
+        own = list(signature.parameters.values())[:-1]
+        function.__signature__ = signature.replace(parameters=[*own, *named])
+    return make, make_vector
 
 
 def _noise_table(model: FiniteMDP, reward_noise: ArrayLike | None) -> NDArray[np.float64] | None:
