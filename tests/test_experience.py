@@ -22,7 +22,7 @@ from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
 from neuralq.q import TableQ
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs.stream import Interaction, Step
-from neuralq.runs.stream.experience import ReplayExperience, RolloutExperience, Sample, StepExperience
+from neuralq.runs.stream.experience import ReplayExperience, RolloutExperience, Sample
 from neuralq.types import Transition
 
 LENGTHS = (3, 1, 4, 2)
@@ -239,9 +239,9 @@ def test_a_restored_replay_of_draws_the_same() -> None:
                 assert torch.equal(x, y)
 
 
-def test_the_online_feed_passes_every_step_once_with_pauses_left_out() -> None:
+def test_every_step_is_passed_on_once_with_pauses_left_out() -> None:
     stream = stream_of(AutoresetMode.NEXT_STEP)
-    experience = StepExperience(N, stream.spec)
+    experience = RolloutExperience(None, N, stream.spec)
     pauses = 0
     for _ in range(20):
         step = stream.step(act)
@@ -263,7 +263,7 @@ def test_traces_learn_the_same_with_and_without_pauses() -> None:
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
         stream = stream_of(mode, 1)
         learner = OnlineLearner(TorchEngine(TableQ(1000, 2), Loss()), OnlineSettings(step_size=0.5))
-        experience = StepExperience(1, stream.spec)
+        experience = RolloutExperience(None, 1, stream.spec)
         while stream.num_steps < 40:
             experience.add(stream.step(act))
             for sample in experience.draw():

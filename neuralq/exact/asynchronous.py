@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from neuralq.exact.asynchronous_kernels import greedy_trials, predecessors, process_queue, settle
 from neuralq.exact.kernels import Floats, sweep
-from neuralq.exact.problem import Found, Problem
+from neuralq.exact.problem import Found, PlanningProblem
 
 __all__ = ["labelled_rtdp", "prioritized_sweeping", "rtdp"]
 
@@ -28,12 +28,12 @@ _TRIALS_BETWEEN_CHECKS = 64
 _STALLED_CHECKS = 20
 
 
-def _threshold(problem: Problem, tol: float, v: Floats) -> float:
+def _threshold(problem: PlanningProblem, tol: float, v: Floats) -> float:
     """A residual that proves the tolerance, or as little as rounding allows."""
     return max(0.5 * tol / problem.reach, problem.rounding(v))
 
 
-def prioritized_sweeping(problem: Problem, tol: float, limit: float) -> Found:
+def prioritized_sweeping(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """Backs up the state of largest priority until every residual is proven small; S backups count as an iteration."""
     rows, num_states = problem.rows, len(problem.acts)
     begins = np.zeros(num_states + 1, dtype=np.int64)
@@ -59,17 +59,17 @@ def prioritized_sweeping(problem: Problem, tol: float, limit: float) -> Found:
     return Found(v, iterations, backups)
 
 
-def _optimistic(problem: Problem) -> Floats:
+def _optimistic(problem: PlanningProblem) -> Floats:
     """An upper bound of V*: the largest reward in every step that any policy can make."""
     most = max(float(problem.mdp.reward.max()), 0.0) * problem.reach
     return np.where(problem.acts, most, 0.0)
 
 
-def _draw_starts(problem: Problem, num: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _draw_starts(problem: PlanningProblem, num: int, rng: np.random.Generator) -> NDArray[np.int64]:
     return rng.choice(len(problem.acts), size=num, p=problem.mdp.start_distribution).astype(np.int64)
 
 
-def rtdp(problem: Problem, tol: float, limit: float, seed: int) -> Found:
+def rtdp(problem: PlanningProblem, tol: float, limit: float, seed: int) -> Found:
     """Backs up the states on simulated greedy paths; a trial counts as an iteration."""
     rng, rows = np.random.default_rng(seed), problem.rows
     v, better = _optimistic(problem), np.empty(len(problem.acts))
@@ -99,7 +99,7 @@ def rtdp(problem: Problem, tol: float, limit: float, seed: int) -> Found:
     return Found(v, iterations, backups)
 
 
-def labelled_rtdp(problem: Problem, tol: float, limit: float, seed: int) -> Found:
+def labelled_rtdp(problem: PlanningProblem, tol: float, limit: float, seed: int) -> Found:
     """RTDP that labels what is accurate and never goes there again; a trial counts as an iteration."""
     rng, rows = np.random.default_rng(seed), problem.rows
     v, settled = _optimistic(problem), ~problem.acts

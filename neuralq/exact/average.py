@@ -29,7 +29,7 @@ from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.exact.evaluation import policy_process
 from neuralq.exact.kernels import Floats
 from neuralq.exact.policies import best_rows
-from neuralq.exact.problem import Problem, prepare, q_of_rows
+from neuralq.exact.problem import PlanningProblem, prepare, q_of_rows
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["AverageEvaluation", "AverageSolution", "evaluate_average", "solve_average"]
@@ -181,10 +181,12 @@ def solve_average(
     return AverageSolution(gain, values, policy, multichain, iterations, bound, bound <= tol, seconds)
 
 
-def _policy_iteration(problem: Problem, tol: float, limit: int) -> tuple[NDArray[np.int64], Floats, Floats, int, float]:
+def _policy_iteration(
+    problem: PlanningProblem, tol: float, limit: int
+) -> tuple[NDArray[np.int64], Floats, Floats, int, float]:
     mdp, states = problem.mdp, np.flatnonzero(problem.acts)
     still = problem.rows._replace(reward=np.zeros(mdp.num_rows))
-    moves = Problem(mdp, 1.0, still, problem.acts, np.inf, 0.0, problem.longest, 0.0)
+    moves = PlanningProblem(mdp, 1.0, still, problem.acts, np.inf, 0.0, problem.longest, 0.0)
     rows, iterations = best_rows(problem, mdp.reward), 0
     while True:
         policy = np.where(mdp.is_terminal, -1, mdp.a_tm1[rows])
@@ -212,7 +214,7 @@ def _policy_iteration(problem: Problem, tol: float, limit: int) -> tuple[NDArray
 
 
 def _relative_value_iteration(
-    problem: Problem, tol: float, limit: int
+    problem: PlanningProblem, tol: float, limit: int
 ) -> tuple[NDArray[np.int64], Floats, Floats, int, float]:
     mdp = problem.mdp
     v, iterations, width = np.zeros(mdp.num_states), 0, np.inf

@@ -1,9 +1,9 @@
 """Optimal values of a known model, with a proof of how close they are.
 
 However the values V were found, one more application of the Bellman optimality operator T proves what they are worth:
-V* lies within `Problem.interval` of T V, and an allowance for the rounding of that very backup is added. That makes the
-reported `bound`, a maximum norm and not a span; a run has converged when it is at most ``tol``. The methods are
-described where they are: `sweeping`, `policies`, `asynchronous`, `undiscounted`.
+V* lies within `PlanningProblem.interval` of T V, and an allowance for the rounding of that very backup is added. That
+makes the reported `bound`, a maximum norm and not a span; a run has converged when it is at most ``tol``. The methods
+are described where they are: `sweeping`, `policies`, `asynchronous`, `undiscounted`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from neuralq.checks import check_choice, check_discount, check_positive, check_w
 from neuralq.exact.asynchronous import labelled_rtdp, prioritized_sweeping, rtdp
 from neuralq.exact.kernels import best_of_rows, spread
 from neuralq.exact.policies import linear_programming, policy_iteration
-from neuralq.exact.problem import Found, Problem, prepare, q_of_rows
+from neuralq.exact.problem import Found, PlanningProblem, prepare, q_of_rows
 from neuralq.exact.sweeping import gauss_seidel, modified_policy_iteration, value_iteration
 from neuralq.exact.undiscounted import (
     bellman_ford,
@@ -35,7 +35,7 @@ from neuralq.mdp import FiniteMDP
 
 __all__ = ["METHODS", "Solution", "count_optimal_policies", "optimal_policies", "solve"]
 
-Solver = Callable[[Problem, float, float], Found]
+Solver = Callable[[PlanningProblem, float, float], Found]
 
 _SOLVERS: dict[str, Solver] = {
     "value-iteration": value_iteration,
@@ -139,7 +139,7 @@ def solve(
     return _proven(problem, found, tol, chosen, began)
 
 
-def _automatic(problem: Problem) -> str:
+def _automatic(problem: PlanningProblem) -> str:
     """The method that suits a model."""
     if is_shortest_path(problem):
         return "bellman-ford"
@@ -147,7 +147,7 @@ def _automatic(problem: Problem) -> str:
     return "policy-iteration" if small else "modified-policy-iteration"
 
 
-def _proven(problem: Problem, found: Found, tol: float, method: str, began: float) -> Solution:
+def _proven(problem: PlanningProblem, found: Found, tol: float, method: str, began: float) -> Solution:
     """One last application of T, and what it proves."""
     mdp, v, rows = problem.mdp, found.v, problem.rows
     values = q_of_rows(problem, v)

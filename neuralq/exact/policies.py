@@ -18,7 +18,7 @@ from scipy.optimize import linprog
 from scipy.sparse.linalg import splu
 
 from neuralq.exact.kernels import Floats, look_ahead
-from neuralq.exact.problem import Found, Problem
+from neuralq.exact.problem import Found, PlanningProblem
 from neuralq.exact.sweeping import PolicyMatrix
 
 __all__ = ["best_rows", "linear_programming", "policy_iteration", "policy_values"]
@@ -29,7 +29,9 @@ _MOST_STEPS = 1e5  # expected steps up to which sweeps evaluate a policy in reas
 _LARGEST_EVALUATION_SWEEPS = 1_000_000
 
 
-def policy_iteration(problem: Problem, tol: float, limit: float, policy: NDArray[np.int64] | None = None) -> Found:
+def policy_iteration(
+    problem: PlanningProblem, tol: float, limit: float, policy: NDArray[np.int64] | None = None
+) -> Found:
     """Policies, each better than the last, until none is; ``policy`` (a row per state) is where to begin."""
     mdp, rows = problem.mdp, problem.rows
     q, states = rows.reward.copy(), np.flatnonzero(problem.acts)
@@ -49,7 +51,7 @@ def policy_iteration(problem: Problem, tol: float, limit: float, policy: NDArray
     return Found(v, iterations, backups, rows_now)
 
 
-def best_rows(problem: Problem, q: Floats) -> NDArray[np.int64]:
+def best_rows(problem: PlanningProblem, q: Floats) -> NDArray[np.int64]:
     """The row of largest value of every state, the lowest where several tie, ``[S]``; 0 where there is none."""
     starts, states = problem.mdp.row_starts, np.flatnonzero(problem.acts)
     best = np.maximum.reduceat(q, starts[states])
@@ -60,7 +62,7 @@ def best_rows(problem: Problem, q: Floats) -> NDArray[np.int64]:
     return rows
 
 
-def policy_values(problem: Problem, policy: NDArray[np.int64], guess: Floats) -> tuple[Floats, float, int]:
+def policy_values(problem: PlanningProblem, policy: NDArray[np.int64], guess: Floats) -> tuple[Floats, float, int]:
     """V_π of a row per state, an estimate of its error, and the sweeps that it took (0 where a matrix was factored)."""
     mdp = problem.mdp
     if mdp.num_states > _MOST_FACTORED and problem.reach <= _MOST_STEPS:
@@ -79,7 +81,7 @@ def policy_values(problem: Problem, policy: NDArray[np.int64], guess: Floats) ->
     return v, 2 * steps * problem.rounding(v), 0
 
 
-def _check_ends(problem: Problem, decay: Floats, chosen: sparse.csr_array) -> None:
+def _check_ends(problem: PlanningProblem, decay: Floats, chosen: sparse.csr_array) -> None:
     """Every state reaches, against the arrows, one that may end, by missing mass or by a discount below 1.
 
     Raises:
@@ -95,7 +97,7 @@ def _check_ends(problem: Problem, decay: Floats, chosen: sparse.csr_array) -> No
         raise ArithmeticError(f"from {problem.mdp.state_name(int(np.argmin(ends)))} it never ends")
 
 
-def linear_programming(problem: Problem, tol: float, limit: float) -> Found:
+def linear_programming(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """The policy that the dual of the linear program puts its weight on, evaluated exactly."""
     mdp, rows = problem.mdp, problem.rows
     every_row = np.arange(mdp.num_rows)

@@ -22,7 +22,7 @@ from scipy import sparse
 from neuralq.exact.kernels import Floats, Rows, look_ahead
 from neuralq.mdp import FiniteMDP
 
-__all__ = ["Found", "Problem", "prepare", "q_of_rows", "rows_of", "trapped_rows"]
+__all__ = ["Found", "PlanningProblem", "prepare", "q_of_rows", "rows_of", "trapped_rows"]
 
 
 class Found(NamedTuple):
@@ -38,7 +38,7 @@ class Found(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class PlanningProblem:
     """A model and γ as solvers see them.
 
     Args:
@@ -94,7 +94,7 @@ def rows_of(mdp: FiniteMDP, gamma: float) -> Rows:
     )
 
 
-def prepare(mdp: FiniteMDP, gamma: float) -> Problem:
+def prepare(mdp: FiniteMDP, gamma: float) -> PlanningProblem:
     """The problem of a model and γ. Where γ does not discount, ``reach`` is still to be found: it is infinite here."""
     rows = rows_of(mdp, gamma)
     acts = ~mdp.is_terminal
@@ -104,10 +104,10 @@ def prepare(mdp: FiniteMDP, gamma: float) -> Problem:
     reach = 1 / (1 - largest) if largest < 1 - 1e-12 else np.inf
     longest = int(np.max(np.diff(mdp.transition.indptr), initial=0))
     size = max(float(mdp.reward.max()), -float(mdp.reward.min()))
-    return Problem(mdp, gamma, rows, acts, reach, least, longest, size)
+    return PlanningProblem(mdp, gamma, rows, acts, reach, least, longest, size)
 
 
-def trapped_rows(problem: Problem) -> NDArray[np.int64]:
+def trapped_rows(problem: PlanningProblem) -> NDArray[np.int64]:
     """Rows by which some policy stays for ever without discount: those of the largest set that need not be left.
 
     Each of them loses nothing and leads only to states that have such a row (the maximal end components, de Alfaro
@@ -130,7 +130,7 @@ def trapped_rows(problem: Problem) -> NDArray[np.int64]:
         stays = kept
 
 
-def q_of_rows(problem: Problem, v: Floats) -> Floats:
+def q_of_rows(problem: PlanningProblem, v: Floats) -> Floats:
     """One look ahead from ``v``, a value for each row, ``[K]``."""
     out = np.empty(problem.mdp.num_rows)
     look_ahead(problem.rows, v, out)

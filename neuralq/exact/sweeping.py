@@ -29,7 +29,7 @@ from neuralq.exact.kernels import (
     survivors,
     sweep,
 )
-from neuralq.exact.problem import Found, Problem
+from neuralq.exact.problem import Found, PlanningProblem
 
 __all__ = ["PolicyMatrix", "gauss_seidel", "modified_policy_iteration", "value_iteration"]
 
@@ -52,7 +52,7 @@ class _Progress:
         return self._stalled > _PATIENCE
 
 
-def value_iteration(problem: Problem, tol: float, limit: float) -> Found:
+def value_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """V ← T V until V* is known within ``tol``."""
     rows, progress = problem.rows, _Progress()
     v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
@@ -79,13 +79,13 @@ def value_iteration(problem: Problem, tol: float, limit: float) -> Found:
     return Found(v, iterations, backups)
 
 
-def _drift(problem: Problem, least: float, largest: float) -> float:
+def _drift(problem: PlanningProblem, least: float, largest: float) -> float:
     """How much the values of two rows can move against each other when V changes by least..largest."""
     most, low = 1 - 1 / problem.reach, problem.least_modulus
     return (most if largest > 0 else low) * largest - (most if least < 0 else low) * least
 
 
-def _further_drift(problem: Problem, drift: float, before: float) -> float:
+def _further_drift(problem: PlanningProblem, drift: float, before: float) -> float:
     """What the drift of all further sweeps will add up to, if it goes on to shrink as now, with a margin."""
     if before == np.inf:
         return np.inf  # nothing is known of the rate yet
@@ -93,7 +93,7 @@ def _further_drift(problem: Problem, drift: float, before: float) -> float:
     return 1.5 * drift * rate / (1 - rate)
 
 
-def _settle(problem: Problem, v: Floats, least: float, largest: float, tol: float) -> tuple[float, float]:
+def _settle(problem: PlanningProblem, v: Floats, least: float, largest: float, tol: float) -> tuple[float, float]:
     """The proven error of ``v = T V``, and that of rounding; at the end a constant error, where known, is removed."""
     down, up = problem.interval(least, largest)
     error = (up - down) / 2 if problem.uniform else max(up, -down, 0.0)
@@ -125,7 +125,7 @@ def _surviving(rows: Rows, v: Floats, slack: float) -> Rows:
     return out
 
 
-def gauss_seidel(problem: Problem, tol: float, limit: float) -> Found:
+def gauss_seidel(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """V(s) ← (T V)(s), state by state, until V* is known within ``tol``."""
     rows, progress = problem.rows, _Progress()
     v, scratch = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
@@ -157,7 +157,7 @@ class PolicyMatrix:
         [3.5]
     """
 
-    def __init__(self, problem: Problem, best_row: NDArray[np.unsignedinteger]) -> None:
+    def __init__(self, problem: PlanningProblem, best_row: NDArray[np.unsignedinteger]) -> None:
         rows, acts = problem.rows, problem.acts
         used = best_row[acts].astype(np.int64)
         num_entries = int(np.sum(rows.indptr[used + 1] - rows.indptr[used], dtype=np.int64))
@@ -182,7 +182,7 @@ class PolicyMatrix:
         return v, sweeps
 
 
-def modified_policy_iteration(problem: Problem, tol: float, limit: float) -> Found:
+def modified_policy_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """A sweep of improvement, then sweeps of the policy alone, until V* is known within ``tol``."""
     rows, progress = problem.rows, _Progress()
     v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))

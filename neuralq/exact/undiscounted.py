@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from neuralq.exact.kernels import Floats, improve
 from neuralq.exact.policies import policy_iteration
-from neuralq.exact.problem import Found, Problem, prepare, q_of_rows, trapped_rows
+from neuralq.exact.problem import Found, PlanningProblem, prepare, q_of_rows, trapped_rows
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["bellman_ford", "certified", "episodic", "is_shortest_path", "path_rounding", "proper_policy_iteration"]
 
 
-def episodic(problem: Problem, method: str) -> Problem:
+def episodic(problem: PlanningProblem, method: str) -> PlanningProblem:
     """The problem with its ``reach`` where every policy ends; for policy iteration it may stay infinite.
 
     Raises:
@@ -44,7 +44,7 @@ def episodic(problem: Problem, method: str) -> Problem:
     )
 
 
-def proper_policy_iteration(problem: Problem, tol: float, limit: float) -> Found:
+def proper_policy_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """Policy iteration from a proper policy.
 
     Raises:
@@ -58,7 +58,7 @@ def proper_policy_iteration(problem: Problem, tol: float, limit: float) -> Found
         ) from error
 
 
-def _proper_policy(problem: Problem) -> NDArray[np.int64]:
+def _proper_policy(problem: PlanningProblem) -> NDArray[np.int64]:
     """A row for every state that leads, with positive probability, one step closer to an end."""
     mdp = problem.mdp
     follow = problem.rows.decay * (mdp.transition @ problem.acts.astype(np.float64))
@@ -78,8 +78,8 @@ def _proper_policy(problem: Problem) -> NDArray[np.int64]:
     return policy
 
 
-def certified(problem: Problem, v: Floats) -> Problem:
-    """The problem with a ``reach`` that makes `Problem.interval` a proof for this ``v``, if there is one."""
+def certified(problem: PlanningProblem, v: Floats) -> PlanningProblem:
+    """The problem with a ``reach`` that makes `PlanningProblem.interval` a proof for this ``v``, if there is one."""
     if math.isfinite(problem.reach):
         return problem
     gap = v[problem.mdp.s_tm1] - q_of_rows(problem, v)
@@ -94,7 +94,7 @@ def certified(problem: Problem, v: Floats) -> Problem:
     return replace(problem, reach=reach) if math.isfinite(reach) and np.all(far > error * reach) else problem
 
 
-def _most_steps(problem: Problem, keep: NDArray[np.bool_]) -> float:
+def _most_steps(problem: PlanningProblem, keep: NDArray[np.bool_]) -> float:
     """The largest expected number of steps over policies of the rows kept; infinite where one never ends."""
     mdp = problem.mdp
     rows = np.flatnonzero(keep)
@@ -116,7 +116,7 @@ def _most_steps(problem: Problem, keep: NDArray[np.bool_]) -> float:
     return float(w.max()) / excess * (1 + 1e-9) if excess > 0.5 else math.inf
 
 
-def is_shortest_path(problem: Problem) -> bool:
+def is_shortest_path(problem: PlanningProblem) -> bool:
     """Whether γ = 1 and every action leads to one state for certain, or ends."""
     lengths = np.diff(problem.mdp.transition.indptr)
     return bool(
@@ -127,7 +127,7 @@ def is_shortest_path(problem: Problem) -> bool:
     )
 
 
-def bellman_ford(problem: Problem, tol: float, limit: float) -> Found:
+def bellman_ford(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """Longest paths to an end: V ← T V from −∞, at most S times (Bellman 1958; Ford 1956).
 
     Raises:
@@ -155,7 +155,7 @@ def bellman_ford(problem: Problem, tol: float, limit: float) -> Found:
     return Found(v, iterations, iterations * mdp.num_rows, best_row.astype(np.int64))
 
 
-def path_rounding(problem: Problem, v: Floats) -> float:
+def path_rounding(problem: PlanningProblem, v: Floats) -> float:
     """What rounding can do to sums along paths: nothing if all rewards are whole numbers."""
     reward = problem.mdp.reward
     if np.all(reward == np.round(reward)) and problem.largest_reward * len(v) < 2**53:
@@ -163,7 +163,7 @@ def path_rounding(problem: Problem, v: Floats) -> float:
     return len(v) * float(np.finfo(np.float64).eps) * (problem.largest_reward + float(np.abs(v).max()))
 
 
-def _earning_cycle(problem: Problem, best_row: NDArray[np.unsignedinteger], s: int) -> str:
+def _earning_cycle(problem: PlanningProblem, best_row: NDArray[np.unsignedinteger], s: int) -> str:
     """Names the cycle that the last improvement leads into."""
     transition, starts = problem.mdp.transition, problem.mdp.row_starts
     path: list[int] = []

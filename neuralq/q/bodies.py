@@ -55,20 +55,25 @@ def _weight(
     return nn.Parameter(torch.from_numpy(drawn).to(dtype))
 
 
-def _bias(
-    rng: np.random.Generator, shape: tuple[int, ...], fan_in: int, dtype: torch.dtype, zero: bool
-) -> nn.Parameter:
-    return nn.Parameter(torch.zeros(shape, dtype=dtype)) if zero else _weight(rng, shape, fan_in, dtype, None)
-
-
-def _silence(weight: nn.Parameter, inputs: tuple[int, int], sparsity: float, rng: np.random.Generator) -> None:
-    """Zero ⌈sparsity · fan_in⌉ of every unit's weights, drawn without replacement; ``inputs``: the axes of fan_in."""
-    first, last = inputs
-    shape = weight.shape
-    lead, fan_in = shape[:first], math.prod(shape[first:last])
-    rows = weight.detach().numpy().reshape(*lead, fan_in, *shape[last:])
-    order = rng.random(rows.shape).argsort(axis=first)
-    np.put_along_axis(rows, order.take(range(math.ceil(sparsity * fan_in)), axis=first), 0, axis=first)
+def _weight_and_bias(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    last: int,
+    bias_shape: tuple[int, ...],
+    dtype: torch.dtype,
+    sparsity: float,
+    gain: float | None,
+) -> tuple[nn.Parameter, nn.Parameter]:
+    """Of a layer; axes 1 to ``last`` of the weight are a unit's inputs, ⌈sparsity · fan_in⌉ of which start at zero."""
+    fan_in = math.prod(shape[1:last])
+    weight = _weight(rng, shape, fan_in, dtype, gain)
+    if sparsity > 0:  # drawn without replacement
+        rows = weight.detach().numpy().reshape(shape[0], fan_in, *shape[last:])
+        order = rng.random(rows.shape).argsort(axis=1)
+        np.put_along_axis(rows, order.take(range(math.ceil(sparsity * fan_in)), axis=1), 0, axis=1)
+    if sparsity > 0 or gain is not None:
+        return weight, nn.Parameter(torch.zeros(bias_shape, dtype=dtype))
+    return weight, _weight(rng, bias_shape, fan_in, dtype, None)
 
 
 class GroupedLinear(nn.Module):
@@ -85,10 +90,8 @@ class GroupedLinear(nn.Module):
         gain: float | None = None,
     ) -> None:
         super().__init__()
-        self.weight = _weight(rng, (copies, fan_in, fan_out), fan_in, dtype, gain)
-        if sparsity > 0:
-            _silence(self.weight, (1, 2), sparsity, rng)
-        self.bias = _bias(rng, (copies, fan_out), fan_in, dtype, sparsity > 0 or gain is not None)
+        shape, bias_shape = (copies, fan_in, fan_out), (copies, fan_out)
+        self.weight, self.bias = _weight_and_bias(rng, shape, 2, bias_shape, dtype, sparsity, gain)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply copy c to ``x[c]``."""
@@ -124,29 +127,20 @@ class Trunk(nn.Module):
     """Dense layers with an activation between them and none after the last: ``[copies, B, in] -> [copies, B, out]``."""
 
     def __init__(
-        self,
-        copies: int,
-        sizes: tuple[int, ...],
-        layer_norm: bool,
-        activation: str,
-        rng: np.random.Generator,
-        dtype: torch.dtype,
-        affine: bool = True,
-        sparsity: float = 0.0,
-        init: str = "uniform",
+        self, body: MLP | Conv, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype
     ) -> None:
         super().__init__()
         self.copies = copies
-        self.sizes = sizes
-        self.layer_norm = layer_norm
-        self.activation = activation
+        self.sizes = sizes = (fan_in, *body.hidden, fan_out)
+        self.layer_norm = body.layer_norm
+        self.activation = body.activation
         layers: list[nn.Module] = []
         norms: list[nn.Module] = []
-        for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            gain = None if init == "uniform" else _HE if i < len(sizes) - 2 else _LAST
-            layers.append(GroupedLinear(copies, fan_in, fan_out, rng, dtype, sparsity, gain))
-            if layer_norm and i < len(sizes) - 2:
-                norms.append(GroupedLayerNorm(copies, (fan_out,), dtype, affine))
+        for i, (below, above) in enumerate(pairwise(sizes)):
+            gain = None if body.init == "uniform" else _HE if i < len(sizes) - 2 else _LAST
+            layers.append(GroupedLinear(copies, below, above, rng, dtype, body.sparsity, gain))
+            if body.layer_norm and i < len(sizes) - 2:
+                norms.append(GroupedLayerNorm(copies, (above,), dtype, body.affine))
         self.layers = nn.ModuleList(layers)
         self.norms = nn.ModuleList(norms)
 
@@ -186,11 +180,10 @@ class GroupedConv(nn.Module):
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
             if height < 1 or width < 1:
                 raise ValueError(f"a kernel of {kernel} does not fit an observation of {in_shape}; use smaller kernels")
-            fan_in = channels * kernel * kernel
-            weights.append(_weight(rng, (copies * fan_out, channels, kernel, kernel), fan_in, dtype, gain))
-            if body.sparsity > 0:
-                _silence(weights[-1], (1, 4), body.sparsity, rng)
-            biases.append(_bias(rng, (copies * fan_out,), fan_in, dtype, body.sparsity > 0 or gain is not None))
+            shape = (copies * fan_out, channels, kernel, kernel)
+            weight, bias = _weight_and_bias(rng, shape, 4, shape[:1], dtype, body.sparsity, gain)
+            weights.append(weight)
+            biases.append(bias)
             if body.layer_norm:
                 norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine))
             channels = fan_out
@@ -263,17 +256,7 @@ class MLP:
 
     def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
-        return Trunk(
-            copies,
-            (fan_in, *self.hidden, fan_out),
-            self.layer_norm,
-            self.activation,
-            rng,
-            dtype,
-            self.affine,
-            self.sparsity,
-            self.init,
-        )
+        return Trunk(self, fan_in, fan_out, copies, rng, dtype)
 
 
 @dataclass(frozen=True)
@@ -328,17 +311,7 @@ class Conv:
 
     def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
-        return Trunk(
-            copies,
-            (fan_in, *self.hidden, fan_out),
-            self.layer_norm,
-            self.activation,
-            rng,
-            dtype,
-            self.affine,
-            self.sparsity,
-            self.init,
-        )
+        return Trunk(self, fan_in, fan_out, copies, rng, dtype)
 
 
 NAMED_BODIES: dict[str, MLP | Conv] = {

@@ -57,10 +57,6 @@ class _Input(nn.Module):
         return rows.reshape(rows.shape[0], self.num_features).expand(self.copies, -1, -1)
 
 
-def _generator(rng: np.random.Generator | int) -> np.random.Generator:
-    return np.random.default_rng(rng)
-
-
 class ActionOutputQ(nn.Module):
     """State in, one output per action: the layout of DQN and of Mitchell's third network.
 
@@ -89,7 +85,7 @@ class ActionOutputQ(nn.Module):
     ) -> None:
         super().__init__()
         check_whole("num_actions", num_actions)
-        body, rng = body or MLP(), _generator(rng)
+        body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, num_actions, 1, rng, dtype)
@@ -127,7 +123,7 @@ class SeparateQ(nn.Module):
     ) -> None:
         super().__init__()
         check_whole("num_actions", num_actions)
-        body, rng = body or MLP(), _generator(rng)
+        body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, num_actions, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, 1, num_actions, rng, dtype)
@@ -166,7 +162,7 @@ class ActionInputQ(nn.Module):
     ) -> None:
         super().__init__()
         check_whole("num_actions", num_actions)
-        body, rng = body or MLP(), _generator(rng)
+        body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features + num_actions, 1, 1, rng, dtype)

@@ -21,6 +21,15 @@ from neuralq.types import QFunction
 
 __all__ = ["GRADIENT", "GradientSettings", "gradient_learner", "started_at_zero"]
 
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "qrc": {"lambda_": 0.8, "beta": 1.0, "cut": "watkins"},
+    "gq": {"lambda_": 0.0, "beta": 0.0, "target_epsilon": 0.0},
+}
+_IGNORED = {
+    "qrc": {"target_epsilon": "bootstraps from the best action; use method='gq' or leave"},
+    "gq": {"cut": "cuts its traces by the importance ratio of its target policy; leave"},
+}
+
 
 @dataclass(frozen=True)
 class GradientSettings:
@@ -64,32 +73,16 @@ class GradientSettings:
 
     def __post_init__(self) -> None:
         """Fill in what is left out; refuse values outside their range and those that would be ignored."""
-        check_choice("method", self.method, ("qrc", "gq"))
-        qrc = self.method == "qrc"
-        if not qrc and self.cut is not None:
-            raise ValueError(
-                f"cut={self.cut!r} would be ignored: method='gq' cuts its traces by the importance ratio of its target "
-                "policy; leave cut out"
-            )
-        if qrc and self.target_epsilon is not None:
-            raise ValueError(
-                f"target_epsilon={self.target_epsilon!r} would be ignored: method='qrc' bootstraps from the best "
-                "action; use method='gq' or leave target_epsilon out"
-            )
+        check_choice("method", self.method, _DEFAULTS)
+        for name, reason in _IGNORED[self.method].items():
+            if (value := getattr(self, name)) is not None:
+                raise ValueError(f"{name}={value!r} would be ignored: method={self.method!r} {reason} {name} out")
         check_positive("step_size", self.step_size)
-        self._settle("lambda_", 0.8 if qrc else 0.0)
-        self._settle("step_size_h", round(0.1 * self.step_size, 15))
-        self._settle("beta", 1.0 if qrc else 0.0)
-        if qrc:
-            self._settle("cut", "watkins")
-        else:
-            self._settle("target_epsilon", 0.0)
-            check_fraction("target_epsilon", self.target_epsilon)  # type: ignore[arg-type]
+        for name, value in {"step_size_h": round(0.1 * self.step_size, 15), **_DEFAULTS[self.method]}.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        check_fraction("target_epsilon", self.target_epsilon or 0.0)
         _ = self.rule  # checks the rest
-
-    def _settle(self, name: str, value: Any) -> None:
-        if getattr(self, name) is None:
-            object.__setattr__(self, name, value)
 
     @property
     def rule(self) -> GradientTDSettings:

@@ -30,7 +30,7 @@ from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
-from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience, StepExperience
+from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
@@ -218,7 +218,7 @@ def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> E
 
 
 def _steps(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
-    return StepExperience(getattr(settings, "num_envs", 1), spec)
+    return RolloutExperience(None, getattr(settings, "num_envs", 1), spec)
 
 
 _SOURCES = {"rollouts": _rollouts, "replay": _replay, "steps": _steps}

@@ -1,7 +1,7 @@
 """Experience on its way from a stream to a learner: what is collected, and when there is something to learn from.
 
 Every step goes in, and after each it is asked what is due. `RolloutExperience` hands out a rollout ``[T, N]`` each time
-one is full, `ReplayExperience` draws from a replay buffer at its period, `StepExperience` passes every step on.
+one is full, or every step as it comes; `ReplayExperience` draws from a replay buffer at its period.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.runs.stream import ObservationSpec, Step
 from neuralq.types import Array, Transition
 
-__all__ = ["ExperienceSource", "ReplayExperience", "RolloutExperience", "Sample", "StepExperience"]
+__all__ = ["ExperienceSource", "ReplayExperience", "RolloutExperience", "Sample"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +65,23 @@ class ExperienceSource(Protocol):
         ...
 
 
-class _Rows:
-    """Preallocated fields ``[T, N]`` with a flag for the entries that hold experience.
+class RolloutExperience:
+    """Collects T steps of N environments, hands them out once, ``[T, N]``, and starts again.
 
-    Rewards and discounts are float64, so that tables and linear functions learn from the numbers that were meant.
+    Rewards and discounts are float64, so that tables and linear functions learn from the numbers that were meant. The
+    memory is that of the next rollout, too.
+
+    Args:
+        num_steps: T; None hands out every step as it comes, ``[N]``.
+        num_envs: N.
+        spec: of the observations.
     """
 
-    def __init__(self, num_steps: int, num_envs: int, spec: ObservationSpec) -> None:
-        lead = (num_steps, num_envs)
-        self.fields: tuple[Array, ...] = (
+    def __init__(self, num_steps: int | None, num_envs: int, spec: ObservationSpec) -> None:
+        self._num_steps = num_steps or 1
+        self._at = 0
+        lead = (self._num_steps, num_envs)
+        self._fields: tuple[Array, ...] = (
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.zeros(lead, np.int64),
             np.ones(lead, np.float32),
@@ -82,52 +90,36 @@ class _Rows:
             np.zeros((*lead, *spec.shape), spec.dtype),
             np.ones(lead, bool),
         )
-        self.held = np.zeros(lead, np.float32)
-        self.transition = Transition(*(torch.from_numpy(x) for x in self.fields))
-
-    def write(self, row: int, step: Step) -> None:
-        if len(step.env_indices) == self.held.shape[1]:
-            for field, value in zip(self.fields, step.rows, strict=True):
-                field[row] = value
-            self.held[row] = 1
-            return
-        # An environment that did not move: nothing may reach across it, and nobody may learn from it.
-        self.fields[4][row] = 0
-        self.fields[6][row] = True
-        self.held[row] = 0
-        for field, value in zip(self.fields, step.rows, strict=True):
-            field[row, step.env_indices] = value
-        self.held[row, step.env_indices] = 1
-
-
-class RolloutExperience:
-    """Collects T steps of N environments, hands them out once, and starts again.
-
-    Args:
-        num_steps: T.
-        num_envs: N.
-        spec: of the observations.
-    """
-
-    def __init__(self, num_steps: int, num_envs: int, spec: ObservationSpec) -> None:
-        self._rows = _Rows(num_steps, num_envs, spec)
-        self._num_steps = num_steps
-        self._at = 0
+        self._held = np.zeros(lead, np.float32)  # 1 where there is experience
+        transition, weight = Transition(*map(torch.from_numpy, self._fields)), torch.from_numpy(self._held)
+        if num_steps is None:
+            transition, weight = transition.map(lambda x: x[0]), weight[0]
+        self._all_held, self._some_held = Sample(transition), Sample(transition, weight)  # made once: views
 
     def add(self, step: Step) -> None:
         """Write the next row."""
-        self._rows.write(self._at, step)
-        self._at += 1
+        row, self._at = self._at, self._at + 1
+        if len(step.env_indices) == self._held.shape[1]:
+            for field, value in zip(self._fields, step.rows, strict=True):
+                field[row] = value
+            self._held[row] = 1
+            return
+        # An environment that did not move: nothing may reach across it, and nobody may learn from it.
+        self._fields[4][row] = 0
+        self._fields[6][row] = True
+        self._held[row] = 0
+        for field, value in zip(self._fields, step.rows, strict=True):
+            field[row, step.env_indices] = value
+        self._held[row, step.env_indices] = 1
 
     def draw(self) -> Iterator[Sample]:
-        """The rollout, once it is full."""
+        """What was collected, once it is all there; environments that did not move have weight 0."""
         if self._at == self._num_steps:
-            held = self._rows.held
             self._at = 0  # before handing out: whoever takes one sample need not ask for another
-            yield Sample(self._rows.transition, None if held.all() else torch.from_numpy(held))
+            yield self._all_held if self._held.all() else self._some_held
 
     def return_errors(self, sample: Sample, errors: Tensor) -> None:
-        """Rollouts have no priorities."""
+        """What is learned from once has no priorities."""
 
     @property
     def between_samples(self) -> bool:
@@ -216,44 +208,3 @@ class ReplayExperience:
         self.buffer.load_state_dict(state["buffer"])
         self._num_added = int(state["num_added"])
         self._due = int(state["due"])
-
-
-class StepExperience:
-    """Hands out every step as it comes, one row per environment ``[N]``.
-
-    Args:
-        num_envs: N.
-        spec: of the observations.
-    """
-
-    def __init__(self, num_envs: int, spec: ObservationSpec) -> None:
-        self._rows = _Rows(1, num_envs, spec)
-        self._row = self._rows.transition.map(lambda x: x[0])  # views, made once: this is asked for at every step
-        self._fresh = False
-
-    def add(self, step: Step) -> None:
-        """Take in the step."""
-        self._rows.write(0, step)
-        self._fresh = True
-
-    def draw(self) -> Iterator[Sample]:
-        """The step, once; environments that did not move have weight 0."""
-        if self._fresh:
-            self._fresh = False
-            held = self._rows.held[0]
-            yield Sample(self._row, None if held.all() else torch.from_numpy(held))
-
-    def return_errors(self, sample: Sample, errors: Tensor) -> None:
-        """Steps are learned from once."""
-
-    @property
-    def between_samples(self) -> bool:
-        """Whether the last step has been handed out."""
-        return not self._fresh
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: steps are not kept."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Nothing to restore."""
