@@ -1,8 +1,8 @@
-"""One-step targets and table updates in a given order, against hand arithmetic.
+"""One-step targets, against hand arithmetic.
 
 Mutants that these tests kill: double Q-learning with selector and value exchanged; the maximum over illegal actions as
 0 (wrong where all values are negative); 0 · -∞ = NaN at a terminal successor, in the value and in its derivative;
-expected Sarsa as a plain mean; reverse order run forwards; the input table written in place.
+expected Sarsa as a plain mean.
 """
 
 from __future__ import annotations
@@ -116,55 +116,3 @@ def test_mismatched_shapes_are_refused() -> None:
     ]:
         with pytest.raises(ValueError, match=message):
             call()
-
-
-# --------------------------------------------------------------------------------- the order of updates in an episode
-
-PATH = torch.tensor([0, 1, 2])
-RIGHT = torch.tensor([0, 0, 0])
-REWARDS = torch.tensor([0.0, 0.0, 100.0])
-CORRIDOR = (PATH, RIGHT, REWARDS, torch.tensor([0.9, 0.9, 0.0]), PATH + 1)
-
-
-def test_reverse_order_carries_the_reward_along_the_whole_path() -> None:
-    """Mitchell 13.3.6: backwards one episode fills the path (100, 90, 81), forwards it moves one entry per episode."""
-    table = torch.zeros(4, 1)
-    assert rules.reverse_episode_update(table, *CORRIDOR)[:, 0].tolist() == pytest.approx([81, 90, 100, 0])
-    seen = []
-    for _ in range(3):
-        table = rules.forward_episode_update(table, *CORRIDOR)
-        seen.append(table[:3, 0].tolist())
-    assert seen[0] == pytest.approx([0, 0, 100])
-    assert seen[1] == pytest.approx([0, 90, 100])
-    assert seen[2] == pytest.approx([81, 90, 100])
-
-
-def test_step_size_by_hand() -> None:
-    """α = ½ from zeros: 50; then ½·.9·50 = 22.5; then ½·.9·22.5 = 10.125. The table handed in is not written."""
-    table = torch.zeros(4, 1)
-    assert rules.reverse_episode_update(table, *CORRIDOR, step_size=0.5)[:, 0].tolist() == [10.125, 22.5, 50.0, 0.0]
-    assert table.eq(0).all()
-
-
-def test_a_repeated_pair_is_updated_twice_and_illegal_actions_stay() -> None:
-    """The loop 0 → 0 → goal: backwards first q = 10, then 1 + .5·10 = 6 overwrites it; forwards the other way round."""
-    table = torch.tensor([[0.0, -INF], [-INF, -INF]])
-    twice = torch.tensor([0, 0])
-    episode = (twice, twice, torch.tensor([1.0, 10.0]), torch.tensor([0.5, 0.0]), torch.tensor([0, 1]))
-    assert rules.reverse_episode_update(table, *episode).tolist() == [[6.0, -INF], [-INF, -INF]]
-    assert rules.forward_episode_update(table, *episode).tolist() == [[10.0, -INF], [-INF, -INF]]
-
-
-def test_order_rules_are_differentiable() -> None:
-    table = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    episode = tuple(x.double() if x.is_floating_point() else x for x in CORRIDOR)
-    assert torch.autograd.gradcheck(lambda q: rules.reverse_episode_update(q, *episode, 0.5), (table,))
-
-
-def test_an_episode_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="one episode"):
-        rules.reverse_episode_update(torch.zeros(4, 1), *(x[:, None] for x in CORRIDOR))
-    with pytest.raises(ValueError, match="step_size must lie"):
-        rules.reverse_episode_update(torch.zeros(4, 1), *CORRIDOR, step_size=2.0)
-    with pytest.raises(ValueError, match="s_t must have the shape"):
-        rules.reverse_episode_update(torch.zeros(4, 1), *CORRIDOR[:4], PATH[:2])

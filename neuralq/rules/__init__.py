@@ -15,7 +15,6 @@ from neuralq.rules.distributional import (
     quantile_huber,
     quantile_levels,
 )
-from neuralq.rules.episodes import forward_episode_update, reverse_episode_update
 from neuralq.rules.losses import huber, residual_gradient_error, semi_gradient_error, squared
 from neuralq.rules.munchausen import munchausen, munchausen_bonus, soft_value
 from neuralq.rules.policies import epsilon_greedy, greedy, greedy_random_ties, k_to_the_q, sample, softmax
@@ -62,7 +61,6 @@ __all__ = [
     "expected_value",
     "followed_mass",
     "followed_values",
-    "forward_episode_update",
     "greedy",
     "greedy_random_ties",
     "huber",
@@ -80,7 +78,6 @@ __all__ = [
     "replace",
     "residual_gradient_error",
     "retrace_coefficients",
-    "reverse_episode_update",
     "sample",
     "sarsa",
     "semi_gradient_error",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from neuralq.checks import check_choice
 
 if TYPE_CHECKING:
-    from neuralq.apps.pages.page import Exhibit
+    from neuralq.apps.pages.page import ChapterPage
 
 __all__ = ["PAGES", "PageEntry", "run_page"]
 
@@ -28,7 +28,7 @@ PAGES = {
     "table-13.1": PageEntry("learning", "table_13_1", "Q-learning in a deterministic world; k to the power Q"),
     "ex-13.1": PageEntry("figures", "exercise_13_1", "every optimal policy of the small grid world"),
     "ex-13.2": PageEntry("exercises", "exercise_13_2", "a grid solved, changed and learned episode by episode"),
-    "ex-13.3": PageEntry("noughts", "exercise_13_3", "tic-tac-toe against one opponent, then another"),
+    "ex-13.3": PageEntry("tic_tac_toe", "exercise_13_3", "tic-tac-toe against one opponent, then another"),
     "ex-13.4": PageEntry("exercises", "exercise_13_4", "one policy is best from every start"),
     "order": PageEntry("ordering", "update_order", "an episode updated forwards and backwards"),
     "replay": PageEntry("ordering", "replaying", "stored transitions learned again"),
@@ -39,7 +39,7 @@ PAGES = {
 }
 
 
-def run_page(name: str) -> Exhibit:
+def run_page(name: str) -> ChapterPage:
     """The result of a page.
 
     Raises:
@@ -51,7 +51,7 @@ def run_page(name: str) -> Exhibit:
     """
     check_choice("page", name, PAGES)
     entry = PAGES[name]
-    page: Callable[[], Exhibit] = getattr(
+    page: Callable[[], ChapterPage] = getattr(
         importlib.import_module(f"neuralq.apps.chapter.{entry.module}"), entry.function
     )
     return page()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from neuralq.apps.chapter.figures import CELLS, all_policies
 from neuralq.apps.pages.grids import policy_grid, q_grid
-from neuralq.apps.pages.page import Chart, Exhibit, Row, Series, claim, number, own
+from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, number, own
 from neuralq.exact import evaluate, solve
 from neuralq.mdp import FiniteMDP
 from neuralq.tabular import Experience, apply
@@ -24,7 +24,7 @@ _VALUES = (8.0, 10.0, 8.0, 10.0, 0.0, 10.0)
 _CHANGES = (((5, WEST), 10.0), ((2, SOUTH), 8.0), ((1, EAST), 6.4))
 
 
-def exercise_13_2() -> Exhibit:
+def exercise_13_2() -> ChapterPage:
     """Exercise 13.2: V*, Q and two changed rewards, then Q-learning round the perimeter, episode by episode.
 
     Source: Mitchell 1997, exercise 13.2.
@@ -58,7 +58,9 @@ def exercise_13_2() -> Exhibit:
         "only the last move is paid; in the second the move before it finds a successor that is worth something; and "
         "so on. Updating each episode backwards would have done all of it at once (see the page order).",
     )
-    return Exhibit("ex-13.2", "A grid solved, changed and learned by hand", "13.3", text, tuple(rows), tuple(drawings))
+    return ChapterPage(
+        "ex-13.2", "A grid solved, changed and learned by hand", "13.3", text, tuple(rows), tuple(drawings)
+    )
 
 
 def perimeter_walk() -> Experience:
@@ -101,7 +103,7 @@ def _num_changed(q: NDArray[np.float64], other: NDArray[np.float64]) -> int:
     return int(np.count_nonzero(np.abs(np.nan_to_num(q - other)) > 1e-9))
 
 
-def exercise_13_4(num_models: int = 30) -> Exhibit:
+def exercise_13_4(num_models: int = 30) -> ChapterPage:
     """Exercise 13.4: in every MDP tried, one policy is best from every start at once.
 
     Args:
@@ -139,7 +141,7 @@ def exercise_13_4(num_models: int = 30) -> Exhibit:
         "from here and another from there.",
     )
     order = np.argsort(values.sum(axis=1))
-    ranks = tuple(float(i) for i in range(1, len(order) + 1))
-    curves = tuple(Series(f"from state {s}", ranks, tuple(map(float, values[order, s]))) for s in range(num_states))
+    ranks = range(1, len(order) + 1)
+    curves = tuple(Series(f"from state {s}", ranks, values[order, s]) for s in range(num_states))
     charts = (Chart("the last model: the best policy is last from every start", "policy", "value", curves),)
-    return Exhibit("ex-13.4", "One policy is best from every start", "13.2", text, rows, charts)
+    return ChapterPage("ex-13.4", "One policy is best from every start", "13.2", text, rows, charts)

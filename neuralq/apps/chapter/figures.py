@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.apps.pages.grids import policy_grid, q_grid, short
-from neuralq.apps.pages.page import Exhibit, Row, claim, misprint, number, own
+from neuralq.apps.pages.page import ChapterPage, Row, claim, misprint, number, own
 from neuralq.exact import evaluate, optimal_policies, solve
 from neuralq.mdp import FiniteMDP
 from neuralq.tabular import Experience, apply
@@ -30,7 +30,7 @@ _PRINTED_Q = {
 _CUT_SHORT = "0.9 · 81 = 72.9, printed without its last digit"
 
 
-def figure_13_2() -> Exhibit:
+def figure_13_2() -> ChapterPage:
     """Figure 13.2: the exact V* and Q of the small grid world, number by number.
 
     Source: Mitchell 1997, Figure 13.2.
@@ -57,10 +57,10 @@ def figure_13_2() -> Exhibit:
         policy_grid("V* and every optimal move", SIGNS, 3, answer.v, answer.optimal_actions),
         q_grid("Q: the value of each move", SIGNS, 3, answer.q),
     )
-    return Exhibit("fig-13.2", "The small grid world, solved exactly", "13.2", text, tuple(rows), drawings)
+    return ChapterPage("fig-13.2", "The small grid world, solved exactly", "13.2", text, tuple(rows), drawings)
 
 
-def figure_13_3() -> Exhibit:
+def figure_13_3() -> ChapterPage:
     """Figure 13.3: one step to the right changes one entry of the table, from 72.9 to 90.
 
     Source: Mitchell 1997, Figure 13.3, rule 13.7.
@@ -93,10 +93,10 @@ def figure_13_3() -> Exhibit:
         q_grid("the table before the move", SIGNS, 3, np.where(before == 0, np.nan, before)),
         q_grid("the table after the move", SIGNS, 3, np.where(after == 0, np.nan, after)),
     )
-    return Exhibit("fig-13.3", "One update of the table", "13.3.2", text, rows, drawings)
+    return ChapterPage("fig-13.3", "One update of the table", "13.3.2", text, rows, drawings)
 
 
-def exercise_13_1() -> Exhibit:
+def exercise_13_1() -> ChapterPage:
     """Exercise 13.1: every optimal policy of Figure 13.2, found twice.
 
     Once from the optimal actions, once by trying all policies.
@@ -130,7 +130,7 @@ def exercise_13_1() -> Exhibit:
         policy_grid(f"optimal policy {i} of {len(policies)}", SIGNS, 3, answer.v, one_hot[p] & (p >= 0)[:, None])
         for i, p in enumerate(policies, 1)
     )
-    return Exhibit("ex-13.1", "All optimal policies of the small grid world", "13.2", text, tuple(rows), drawings)
+    return ChapterPage("ex-13.1", "All optimal policies of the small grid world", "13.2", text, tuple(rows), drawings)
 
 
 def all_policies(mdp: FiniteMDP) -> list[NDArray[np.int64]]:

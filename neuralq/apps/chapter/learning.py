@@ -7,8 +7,9 @@ import torch
 from numpy.typing import NDArray
 
 from neuralq.apps.chapter.figures import SIGNS
+from neuralq.apps.chapter.ordering import part_of
 from neuralq.apps.pages.grids import q_grid
-from neuralq.apps.pages.page import Chart, Exhibit, Row, Series, claim, misprint, number, own, spread
+from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.exact import solve
 from neuralq.rules import k_to_the_q
 from neuralq.tabular import Band, Learned, RunOptions, apply, compile_model, over_seeds, q_learning, sweep_errors
@@ -20,7 +21,7 @@ __all__ = ["table_13_1"]
 _NUM_STEPS = 500
 
 
-def table_13_1(num_seeds: int = 20) -> Exhibit:
+def table_13_1(num_seeds: int = 20) -> ChapterPage:
     """Table 13.1: the deterministic rule never overestimates, never takes back, and finds Q exactly.
 
     Args:
@@ -45,7 +46,7 @@ def table_13_1(num_seeds: int = 20) -> Exhibit:
     band = over_seeds(learn, num_seeds)
     nothing = np.where(mdp.legal, 0.0, np.nan)
     low, middle, high = band.interval()
-    curve = Series(f"{num_seeds} seeds", *(tuple(map(float, part)) for part in (band.steps, middle, low, high)))
+    curve = Series(f"{num_seeds} seeds", band.steps, middle, low, high)
     chart = Chart("largest error of the table", "updates", "max |Q̂ − Q|", (curve,))
     early = apply(nothing, _first_episodes(band.runs[0], 3), step_size="deterministic").q
     drawings = (
@@ -65,7 +66,7 @@ def table_13_1(num_seeds: int = 20) -> Exhibit:
         "the exponent and show k times Q̂: then k cancels out of the fraction and has no effect at all.",
     )
     rows = (*_facts(band, nothing, exact_q), *_exploration())
-    return Exhibit("table-13.1", "Q-learning in a deterministic world", "13.3", text, rows, drawings)
+    return ChapterPage("table-13.1", "Q-learning in a deterministic world", "13.3", text, rows, drawings)
 
 
 def _facts(band: Band, nothing: NDArray[np.float64], exact_q: NDArray[np.float64]) -> tuple[Row, ...]:
@@ -108,5 +109,4 @@ def _exploration() -> tuple[Row, ...]:
 def _first_episodes(run: Learned, count: int) -> Experience:
     e = run.experience
     assert e is not None
-    end = int(np.flatnonzero(e.last_t)[count - 1]) + 1
-    return Experience(e.s_tm1[:end], e.a_tm1[:end], e.r_t[:end], e.discount_t[:end], e.s_t[:end], e.last_t[:end])
+    return part_of(e, slice(int(np.flatnonzero(e.last_t)[count - 1]) + 1))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neuralq.apps.chapter.ordering import path_to_end
 from neuralq.apps.pages.grids import policy_grid
-from neuralq.apps.pages.page import Chart, Exhibit, Row, Series, claim, number, own, spread
+from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, number, own, spread
 from neuralq.exact import solve
 from neuralq.mdp import FiniteMDP
 from neuralq.tabular import (
@@ -28,7 +29,7 @@ _PLANNING = {0: 40_000, 5: 12_000, 50: 6_000}  # real steps, enough for 30 episo
 _PRINTED = {0: (25, "about 25"), 5: (5, "about 5"), 50: (3, "about 3")}
 
 
-def dyna_maze(num_seeds: int = 30) -> Exhibit:
+def dyna_maze(num_seeds: int = 30) -> ChapterPage:
     """Imagined moves between the real ones: the maze is learned in a few episodes instead of dozens.
 
     Args:
@@ -54,8 +55,7 @@ def dyna_maze(num_seeds: int = 30) -> Exhibit:
         about, words = _PRINTED[n]
         rows.append(claim(f"n = {n}: episodes until at most 20 steps", words, reached, 0 < reached <= 1.5 * about + 1))
         low, high = np.quantile(lengths, [0.025, 0.975], axis=0)
-        parts = (tuple(map(float, part[1:])) for part in (np.arange(1, _EPISODES + 1), mean, low, high))
-        curves.append(Series(f"n = {n}", *parts))
+        curves.append(Series(f"n = {n}", range(2, _EPISODES + 1), mean[1:], low[1:], high[1:]))
     ordered = bool(means[0][1] > means[5][1] > means[50][1])
     rows.append(claim("mean steps in episode 2 fall with n", "yes", "yes" if ordered else "no", ordered))
     rows.append(_blocking_row(min(num_seeds, 6)))
@@ -71,7 +71,7 @@ def dyna_maze(num_seeds: int = 30) -> Exhibit:
         policy_grid("V* and every optimal move", grid.signs, grid.num_columns, answer.v, answer.optimal_actions),
         Chart("learning the maze", "episode", "mean steps", tuple(curves), log_y=True),
     )
-    return Exhibit("dyna", "Learning and planning at once", "13.3.6", text, tuple(rows), drawings)
+    return ChapterPage("dyna", "Learning and planning at once", "13.3.6", text, tuple(rows), drawings)
 
 
 def _episode_lengths(mdp: FiniteMDP, num_planning: int, num_steps: int, num_seeds: int) -> NDArray[np.int64]:
@@ -106,7 +106,7 @@ def _blocking_row(num_seeds: int) -> Row:
     return claim(what, "Dyna-Q+ more", f"{np.mean(goals[0]):.1f} against {np.mean(goals[1]):.1f}", better)
 
 
-def sweeping(num_seeds: int = 20) -> Exhibit:
+def sweeping(num_seeds: int = 20) -> ChapterPage:
     """Prioritized sweeping needs a fraction of Dyna's updates: it plans where the table is most wrong.
 
     Args:
@@ -136,10 +136,10 @@ def sweeping(num_seeds: int = 20) -> Exhibit:
         "A move that was never tried is believed to be worth 1, as much as any way can earn: so the agent explores on "
         "purpose. Otherwise both learners act alike, and may do five updates for each real move.",
     )
-    ranks = tuple(float(i) for i in range(1, num_seeds + 1))
-    curves = tuple(Series(n, ranks, tuple(map(float, sorted(found[:, i, 1])))) for i, n in enumerate(_METHODS))
+    ranks = range(1, num_seeds + 1)
+    curves = tuple(Series(name, ranks, np.sort(found[:, i, 1])) for i, name in enumerate(_METHODS))
     charts = (Chart("updates until the way is shortest", "run, the quickest first", "updates", curves, log_y=True),)
-    return Exhibit("sweeping", "Planning where it matters", "13.3.6", text, tuple(rows), charts)
+    return ChapterPage("sweeping", "Planning where it matters", "13.3.6", text, tuple(rows), charts)
 
 
 _METHODS = ("Dyna", "prioritized sweeping")
@@ -150,7 +150,8 @@ def _until_optimal(mdp: FiniteMDP, model: Model, name: str, seed: int) -> tuple[
     num_steps = 50
     while num_steps < 300_000:
         run = _run(model, name, num_steps, seed)
-        if _greedy_length(mdp, run.policy) == _OPTIMUM:
+        way = path_to_end(mdp, run.policy, dyna.GAMMA, _OPTIMUM)
+        if way.last_t[-1] and len(way) == _OPTIMUM:
             return num_steps, run.num_backups
         num_steps += max(10, num_steps // 10)
     raise RuntimeError(f"{name} found no shortest way in {num_steps} steps with seed {seed}")
@@ -163,14 +164,3 @@ def _run(model: Model, name: str, num_steps: int, seed: int) -> Learned:
     return prioritized_sweeping(
         model, num_steps, dyna.GAMMA, num_planning=5, bored_after=1, optimistic_reward=1 - dyna.GAMMA, seed=seed
     )
-
-
-def _greedy_length(mdp: FiniteMDP, policy: NDArray[np.int64]) -> int:
-    """Moves from the start to the goal, or 0 if the goal is not reached by the shortest way."""
-    s = int(np.argmax(mdp.start_distribution))
-    for length in range(1, _OPTIMUM + 1):
-        row = mdp.row_index[s, policy[s]]
-        if mdp.termination[row] > 0:
-            return length
-        s = int(mdp.transition[[row]].indices[0])
-    return 0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neuralq.apps.pages.page import Chart, Exhibit, Row, Series, claim, misprint, number, own, spread
+from neuralq.apps.chapter.ordering import part_of
+from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.exact import evaluate, solve
 from neuralq.rules import lambda_returns
 from neuralq.tabular import Experience, RunOptions, batch_td, predict, td_lambda
@@ -22,7 +23,7 @@ _LAMBDAS = (0.0, 0.3, 0.7, 1.0)
 _STEP_SIZES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
 
 
-def lambda_recursion() -> Exhibit:
+def lambda_recursion() -> ChapterPage:
     """The recursion of Q^λ equals its sum with the value of s_{t+1} in the bracket, not with that of s_t as printed.
 
     Source: Mitchell 1997, section 13.5.
@@ -57,14 +58,14 @@ def lambda_recursion() -> Exhibit:
         "λ = 1 believes only what was observed. Along an optimal path that is exact, whatever the table says; after a "
         "detour it blames the first move for it. Watkins cuts the return at the exploring move, Peng does not.",
     )
-    every = tuple(i / 20 for i in range(21))
+    every = [i / 20 for i in range(21)]
     curves = (
-        Series("the sum", every, tuple(_sum_of_returns(r, v_t, gamma, x) for x in every)),
-        Series("recursion, s_t+1", every, tuple(_recursion(r, v_t, gamma, x) for x in every)),
-        Series("recursion, s_t as printed", every, tuple(_recursion(r, v_tm1, gamma, x) for x in every)),
+        Series("the sum", every, [_sum_of_returns(r, v_t, gamma, x) for x in every]),
+        Series("recursion, s_t+1", every, [_recursion(r, v_t, gamma, x) for x in every]),
+        Series("recursion, s_t as printed", every, [_recursion(r, v_tm1, gamma, x) for x in every]),
     )
     charts = (Chart("Q^λ of the first move", "λ", "Q^λ", curves),)
-    return Exhibit("td-lambda", "Q^λ: the sum and the recursion", "13.5", text, tuple(rows), charts)
+    return ChapterPage("td-lambda", "Q^λ: the sum and the recursion", "13.5", text, tuple(rows), charts)
 
 
 def _sum_of_returns(r: Floats, v_t: Floats, gamma: float, lambda_: float) -> float:
@@ -102,7 +103,7 @@ def _best_and_detour(gamma: float) -> list[Row]:
     ]
 
 
-def random_walk_page(num_sets: int = 100) -> Exhibit:
+def random_walk_page(num_sets: int = 100) -> ChapterPage:
     """Sutton's random walk: TD(λ) with λ < 1 predicts better than waiting for the end, from the same ten walks.
 
     Args:
@@ -128,7 +129,7 @@ def random_walk_page(num_sets: int = 100) -> Exhibit:
         "walks which meet in a state have the same future. λ = 0 learns from the next prediction and so combines the "
         "walks. Shown ten walks just once, a little of both is best.",
     )
-    return Exhibit("random-walk", "Predicting a random walk", "13.5", text, tuple(rows), (many_chart, once_chart))
+    return ChapterPage("random-walk", "Predicting a random walk", "13.5", text, tuple(rows), (many_chart, once_chart))
 
 
 def _repeated_presentations(sets: list[Experience]) -> tuple[list[Row], Chart]:
@@ -140,7 +141,7 @@ def _repeated_presentations(sets: list[Experience]) -> tuple[list[Row], Chart]:
     rows = [own(f"repeated presentations, λ = {x:g}: error", spread(e)) for x, e in zip(_LAMBDAS, errors, strict=True)]
     rising = settled and bool((np.diff(means) > -0.001).all() and means[3] > 1.1 * means[2])
     rows.append(claim("repeated presentations: mean error over λ", "rises, worst at 1", _arrow(means), rising))
-    curve = Series("until nothing moves", _LAMBDAS, tuple(map(float, means)))
+    curve = Series("until nothing moves", _LAMBDAS, means)
     return rows, Chart("mean error after repeated presentations", "λ", "RMS error", (curve,))
 
 
@@ -153,7 +154,7 @@ def _one_presentation(sets: list[Experience]) -> tuple[list[Row], Chart]:
         claim("one presentation, best α: λ = 0, then 0.3", "no worse", _arrow(best[:2]), best[1] <= best[0] + 0.003),
         claim("one presentation, best α: λ = 1 against λ = 0.3", "1.7× or worse", ratio, ratio >= 1.7),
     ]
-    series = (Series(f"λ = {x:g}", _STEP_SIZES, tuple(map(float, e))) for x, e in zip(_LAMBDAS, once, strict=True))
+    series = (Series(f"λ = {x:g}", _STEP_SIZES, e) for x, e in zip(_LAMBDAS, once, strict=True))
     return rows, Chart("mean error after one presentation", "α", "RMS error", tuple(series))
 
 
@@ -165,8 +166,7 @@ def _training_sets(num_sets: int) -> list[Experience]:
     e = run.experience
     assert e is not None
     ends = [0, *(np.flatnonzero(e.last_t)[_SEQUENCES - 1 :: _SEQUENCES] + 1).tolist()]
-    parts = [slice(ends[i], ends[i + 1]) for i in range(num_sets)]
-    return [Experience(e.s_tm1[p], e.a_tm1[p], e.r_t[p], e.discount_t[p], e.s_t[p], e.last_t[p]) for p in parts]
+    return [part_of(e, slice(ends[i], ends[i + 1])) for i in range(num_sets)]
 
 
 def _rms(v: Floats) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.apps.pages.grids import short
-from neuralq.apps.pages.page import Cell, Exhibit, Grid, Row, claim, number, own, spread
+from neuralq.apps.pages.page import ChapterPage, GridDrawing, Row, Square, claim, number, own, spread
 from neuralq.exact import Solution, evaluate, solve
 from neuralq.mdp import FiniteMDP
 from neuralq.tabular import Band, EpsilonGreedy, Learned, RunOptions, compile_model, over_seeds, q_learning
@@ -20,7 +20,7 @@ _NUM_STEPS = 600_000
 _AGAINST_RANDOM = {"X": 0.99479, "O": 0.92487}
 
 
-def exercise_13_3(num_seeds: int = 5) -> Exhibit:
+def exercise_13_3(num_seeds: int = 5) -> ChapterPage:
     """Exercise 13.3: Q-learning finds the best answer to the opponent it met, and is not safe against a better one.
 
     Args:
@@ -56,7 +56,7 @@ def exercise_13_3(num_seeds: int = 5) -> Exhibit:
         _opening("best answer to the opponent that blocks: value of each first move", best.q[0]),
         _opening("the same, learned (one run)", met.q[0, 0]),
     )
-    return Exhibit("ex-13.3", "Tic-tac-toe", "13.3", text, tuple(rows), drawings)
+    return ChapterPage("ex-13.3", "Tic-tac-toe", "13.3", text, tuple(rows), drawings)
 
 
 def _random_opponent() -> list[Row]:
@@ -119,5 +119,5 @@ def _trained_on_optimal(forced: FiniteMDP, optimal: FiniteMDP, safe: Solution, m
     ]
 
 
-def _opening(title: str, q: NDArray[np.float64]) -> Grid:
-    return Grid(title, 3, tuple(Cell(short(float(value))) for value in q))
+def _opening(title: str, q: NDArray[np.float64]) -> GridDrawing:
+    return GridDrawing(title, 3, tuple(Square(short(float(value))) for value in q))

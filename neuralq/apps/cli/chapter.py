@@ -13,8 +13,8 @@ from rich.table import Table
 
 from neuralq.apps.chapter import PAGES, run_page
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.pages.page import Exhibit
-from neuralq.apps.pages.svg import exhibit_svg
+from neuralq.apps.pages.page import ChapterPage
+from neuralq.apps.pages.svg import page_svg
 from neuralq.apps.pages.text import drawing_lines, shown
 
 __all__ = ["chapter"]
@@ -41,32 +41,32 @@ def chapter(argv: list[str]) -> int:
         print_result({"pages": {name: entry.summary for name, entry in PAGES.items()}}, options.json, lines)
         return 0
     began = time.perf_counter()
-    exhibit = run_page(options.page)
-    plain = {**exhibit.plain(), "seconds": time.perf_counter() - began}
+    page = run_page(options.page)
+    plain = {**page.plain(), "seconds": time.perf_counter() - began}
     if options.svg is not None:
-        Path(options.svg).write_text(exhibit_svg(exhibit), encoding="utf-8")
+        Path(options.svg).write_text(page_svg(page), encoding="utf-8")
         plain["svg"] = options.svg
     if not options.json:
-        _print(exhibit)
+        _print(page)
     lines = [f"drawings: {options.svg}"] if options.svg is not None else []
     print_result(plain, options.json, lines)
-    if not exhibit.reproduced:
-        wrong = [row.what for row in exhibit.rows if row.verdict == "differs"]
+    if not page.reproduced:
+        wrong = [row.what for row in page.rows if row.verdict == "differs"]
         raise Failure(f"{options.page}: not reproduced: {'; '.join(wrong)}")
     return 0
 
 
-def _print(exhibit: Exhibit) -> None:
+def _print(page: ChapterPage) -> None:
     # A pipe has no width of its own: wide enough for the tables, so that nothing is cut.
     width = min(shutil.get_terminal_size((120, 24)).columns, 120)
     console = Console(highlight=False, width=max(width, 60), soft_wrap=False)
-    console.print(f"[bold]{exhibit.title}[/bold] (Mitchell 1997, {exhibit.section})")
-    for paragraph in exhibit.text:
+    console.print(f"[bold]{page.title}[/bold] (Mitchell 1997, {page.section})")
+    for paragraph in page.text:
         console.print("\n" + textwrap.fill(paragraph, min(console.width, 100)), markup=False)
-    for drawing in exhibit.drawings:
+    for drawing in page.drawings:
         print("\n" + "\n".join(drawing_lines(drawing)))  # not wrapped: a grid that is too wide is still a grid
     table = Table("", "expected", "ours", "", "", box=None, pad_edge=False, header_style="bold")
-    for row in exhibit.rows:
+    for row in page.rows:
         style = _STYLES[row.verdict]
         verdict = "" if row.verdict == "ours" else f"[{style}]{row.verdict}[/{style}]"
         table.add_row(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.pages.grids import short
-from neuralq.apps.pages.page import Arrow, Cell, Exhibit, Grid
-from neuralq.apps.pages.svg import exhibit_svg
+from neuralq.apps.pages.page import Arrow, ChapterPage, GridDrawing, Square
+from neuralq.apps.pages.svg import page_svg
 from neuralq.apps.pages.text import ARROWS, drawing_lines
 from neuralq.exact import METHODS, Solution, count_optimal_policies
 from neuralq.exact import solve as solve_mdp
@@ -39,8 +39,8 @@ def solve(argv: list[str]) -> int:
     if options.svg is not None:
         if grid is None:
             raise Failure(f"{options.env} names no rows and columns, so there is no grid to draw; leave out --svg")
-        page = Exhibit("solve", f"{options.env}, γ = {options.gamma:g}", "", (), (), (grid,))
-        Path(options.svg).write_text(exhibit_svg(page), encoding="utf-8")
+        page = ChapterPage("solve", f"{options.env}, γ = {options.gamma:g}", "", (), (), (grid,))
+        Path(options.svg).write_text(page_svg(page), encoding="utf-8")
     actions = [np.flatnonzero(row).tolist() for row in solution.optimal_actions]
     plain = {
         "env": options.env,
@@ -127,20 +127,20 @@ class _Layout:
         self.directions = directions
         self.signs = signs
 
-    def drawn(self, mdp: FiniteMDP, solution: Solution) -> Grid:
+    def drawn(self, mdp: FiniteMDP, solution: Solution) -> GridDrawing:
         """V* with an arrow for every optimal move; walls are cells that nothing leads to and nothing leaves."""
         entered = _entered(mdp)
         cells = []
         for s in range(mdp.num_states):
             if self.signs[s] != " ":
-                cells.append(Cell(self.signs[s]))
+                cells.append(Square(self.signs[s]))
             elif mdp.is_terminal[s]:
-                cells.append(Cell("end") if entered[s] else Cell(wall=True))
+                cells.append(Square("end") if entered[s] else Square(wall=True))
             else:
                 best = (self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
                 arrows = tuple(Arrow(d) for d in sorted(d for d in best if d is not None))
-                cells.append(Cell(short(float(solution.v[s])), arrows))
-        return Grid("V* and every optimal move", self.num_columns, tuple(cells))
+                cells.append(Square(short(float(solution.v[s])), arrows))
+        return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
 
 
 def _layout(env: Any, mdp: FiniteMDP) -> _Layout | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neuralq.apps.pages.page import Arrow, Cell, Grid
+from neuralq.apps.pages.page import Arrow, GridDrawing, Square
 
 __all__ = ["best_actions", "policy_grid", "q_grid", "short"]
 
@@ -33,7 +33,7 @@ def best_actions(q: ArrayLike, tol: float = 1e-9) -> NDArray[np.bool_]:
     return np.asarray((values >= values.max(axis=1, keepdims=True) - tol) & np.isfinite(values))
 
 
-def policy_grid(title: str, signs: str, num_columns: int, v: ArrayLike, actions: NDArray[np.bool_]) -> Grid:
+def policy_grid(title: str, signs: str, num_columns: int, v: ArrayLike, actions: NDArray[np.bool_]) -> GridDrawing:
     """A map with the value of every cell and an arrow for every action given; goals and traps keep their sign.
 
     Args:
@@ -50,15 +50,15 @@ def policy_grid(title: str, signs: str, num_columns: int, v: ArrayLike, actions:
     cells = []
     for sign, value, chosen in zip(signs, np.asarray(v, dtype=np.float64), actions, strict=True):
         if sign in _WALLS:
-            cells.append(Cell(wall=True))
+            cells.append(Square(wall=True))
         elif chosen.any():
-            cells.append(Cell(short(float(value)), tuple(Arrow(int(a)) for a in np.flatnonzero(chosen[:4]))))
+            cells.append(Square(short(float(value)), tuple(Arrow(int(a)) for a in np.flatnonzero(chosen[:4]))))
         else:
-            cells.append(Cell(sign if sign.isalpha() else short(float(value))))
-    return Grid(title, num_columns, tuple(cells))
+            cells.append(Square(sign if sign.isalpha() else short(float(value))))
+    return GridDrawing(title, num_columns, tuple(cells))
 
 
-def q_grid(title: str, signs: str, num_columns: int, q: ArrayLike) -> Grid:
+def q_grid(title: str, signs: str, num_columns: int, q: ArrayLike) -> GridDrawing:
     """A map with the value of every action beside its arrow, the best ones marked.
 
     Example:
@@ -71,5 +71,5 @@ def q_grid(title: str, signs: str, num_columns: int, q: ArrayLike) -> Grid:
     for s, sign in enumerate(signs):
         legal = np.flatnonzero(np.isfinite(values[s, :4]))
         arrows = tuple(Arrow(int(a), short(float(values[s, a])), bool(best[s, a])) for a in legal)
-        cells.append(Cell(sign if sign.isalpha() else "", arrows, sign in _WALLS))
-    return Grid(title, num_columns, tuple(cells))
+        cells.append(Square(sign if sign.isalpha() else "", arrows, sign in _WALLS))
+    return GridDrawing(title, num_columns, tuple(cells))

@@ -1,27 +1,30 @@
 """What a page of the chapter found: numbers beside the printed ones, drawings and a short explanation.
 
-A page is a function without required arguments that returns an `Exhibit`. It prints nothing; `neuralq.apps.pages.text`
-and `neuralq.apps.pages.svg` show it, and tests read its numbers.
+A page is a function without required arguments that returns a `ChapterPage`. It prints nothing;
+`neuralq.apps.pages.text` and `neuralq.apps.pages.svg` show it, and tests read its numbers.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neuralq.types import Array
+
 __all__ = [
     "Arrow",
-    "Cell",
+    "ChapterPage",
     "Chart",
     "Drawing",
-    "Exhibit",
-    "Grid",
+    "GridDrawing",
     "Row",
     "Series",
+    "Square",
     "claim",
     "misprint",
     "number",
@@ -61,7 +64,7 @@ class Arrow:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Square:
     """One cell of a drawn grid: its label, its moves, and whether it is a wall."""
 
     label: str = ""
@@ -70,23 +73,27 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Grid:
+class GridDrawing:
     """A grid with arrows and values; ``cells`` row by row from the top left."""
 
     title: str
     num_columns: int
-    cells: tuple[Cell, ...]
+    cells: tuple[Square, ...]
 
 
 @dataclass(frozen=True)
 class Series:
-    """A curve, with the interval over seeds where there is one."""
+    """A curve, with the interval over seeds where there is one; kept as tuples of numbers."""
 
     name: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
+    x: Sequence[float] | Array
+    y: Sequence[float] | Array
+    low: Sequence[float] | Array = ()
+    high: Sequence[float] | Array = ()
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "low", "high"):
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
 
 
 @dataclass(frozen=True)
@@ -100,11 +107,11 @@ class Chart:
     log_y: bool = False
 
 
-Drawing = Grid | Chart
+Drawing = GridDrawing | Chart
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class ChapterPage:
     """The result of one page.
 
     Args:
@@ -135,10 +142,7 @@ class Exhibit:
             "title": self.title,
             "section": self.section,
             "reproduced": self.reproduced,
-            "rows": [
-                {"what": r.what, "book": r.book, "ours": r.ours, "verdict": r.verdict, "note": r.note}
-                for r in self.rows
-            ],
+            "rows": [asdict(row) for row in self.rows],
         }
 
 

@@ -9,36 +9,35 @@ import math
 from collections.abc import Callable, Iterator
 from html import escape
 
-from neuralq.apps.pages.page import Arrow, Cell, Chart, Exhibit, Grid, Series
+from neuralq.apps.pages.page import Arrow, ChapterPage, Chart, GridDrawing, Series, Square
+from neuralq.figures import COLOURS
 
-__all__ = ["exhibit_svg"]
+__all__ = ["page_svg"]
 
-# Okabe and Ito (2008), "Color universal design": told apart with every common colour blindness.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _INK, _PALE, _GOAL = "#222222", "#999999", "#d7ecd9"
 _WIDTH, _MARGIN, _TITLE = 640, 20, 34
 _PLOT_HEIGHT, _LEFT, _BOTTOM = 240, 62, 46
 _STEPS = ((0, -1), (1, 0), (0, 1), (-1, 0))  # x and y of north, east, south, west
 
 
-def exhibit_svg(exhibit: Exhibit) -> str:
+def page_svg(page: ChapterPage) -> str:
     """The drawings of a page, one below the other.
 
     Raises:
         ValueError: the page has no drawing.
 
     Example:
-        >>> from neuralq.apps.pages.page import Cell
-        >>> page = Exhibit("p", "a page", "13.2", (), (), (Grid("one cell", 1, (Cell("9"),)),))
-        >>> exhibit_svg(page).startswith("<svg")
+        >>> from neuralq.apps.pages.page import Square
+        >>> page = ChapterPage("p", "a page", "13.2", (), (), (GridDrawing("one cell", 1, (Square("9"),)),))
+        >>> page_svg(page).startswith("<svg")
         True
     """
-    if not exhibit.drawings:
-        raise ValueError(f"the page {exhibit.page!r} has no drawing")
+    if not page.drawings:
+        raise ValueError(f"the page {page.page!r} has no drawing")
     parts: list[str] = []
     top = float(_MARGIN)
-    for drawing in exhibit.drawings:
-        height, lines = _grid(drawing) if isinstance(drawing, Grid) else _chart(drawing)
+    for drawing in page.drawings:
+        height, lines = _grid(drawing) if isinstance(drawing, GridDrawing) else _chart(drawing)
         heading = _text(_MARGIN, top + 16, drawing.title, size=15, anchor="start", weight="bold")
         parts.append(f'<g role="img"><title>{escape(drawing.title)}</title>{heading}')
         parts.append(f'<g transform="translate(0 {top + _TITLE})">')
@@ -46,7 +45,7 @@ def exhibit_svg(exhibit: Exhibit) -> str:
         top += _TITLE + height + _MARGIN
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {top:.0f}" width="{_WIDTH}" height="{top:.0f}" '
-        f'font-family="sans-serif"><title>{escape(exhibit.title)}</title>'
+        f'font-family="sans-serif"><title>{escape(page.title)}</title>'
         '<rect width="100%" height="100%" fill="white"/>'
     )
     return "\n".join([head, *parts, "</svg>\n"])
@@ -61,7 +60,7 @@ def _text(
     )
 
 
-def _grid(grid: Grid) -> tuple[float, list[str]]:
+def _grid(grid: GridDrawing) -> tuple[float, list[str]]:
     num_rows = math.ceil(len(grid.cells) / grid.num_columns)
     valued = any(arrow.text for cell in grid.cells for arrow in cell.arrows)
     side = min(130.0 if valued else 96.0, (_WIDTH - 2 * _MARGIN) / grid.num_columns)
@@ -76,7 +75,7 @@ def _grid(grid: Grid) -> tuple[float, list[str]]:
     return num_rows * side, lines
 
 
-def _cell(cell: Cell, x: float, y: float, side: float) -> Iterator[str]:
+def _cell(cell: Square, x: float, y: float, side: float) -> Iterator[str]:
     if cell.label:
         yield _text(x, y + side * 0.06, cell.label, size=max(8.0, side * 0.17), weight="bold")
     for arrow in cell.arrows:
@@ -88,7 +87,7 @@ def _arrow(arrow: Arrow, x: float, y: float, side: float) -> Iterator[str]:
     dx, dy = _STEPS[arrow.direction]
     start, tip, wing = side * 0.27, side * 0.45, side * 0.06
     x0, y0, x1, y1 = x + dx * start, y + dy * start, x + dx * tip, y + dy * tip
-    colour, width = (_COLOURS[0], 2.4) if arrow.best else (_PALE, 1.2)
+    colour, width = (COLOURS[0], 2.4) if arrow.best else (_PALE, 1.2)
     bx, by = x1 - dx * wing, y1 - dy * wing  # where the head begins
     yield (
         f'<path d="M{x0:.1f} {y0:.1f}L{bx:.1f} {by:.1f}" stroke="{colour}" stroke-width="{width}"/>'
@@ -130,7 +129,7 @@ def _chart(chart: Chart) -> tuple[float, list[str]]:
         lines.append(_text(at, _PLOT_HEIGHT + 16, f"{x:.4g}", size=11))
     lines.append(_text(_WIDTH / 2, _PLOT_HEIGHT + 34, f"{chart.x_label}; upwards: {chart.y_label}", size=12))
     for i, one in enumerate(chart.series):
-        lines += _curve(one, _COLOURS[i % len(_COLOURS)], _PLOT_HEIGHT + _BOTTOM + 8 + 18 * i, place)
+        lines += _curve(one, COLOURS[i % len(COLOURS)], _PLOT_HEIGHT + _BOTTOM + 8 + 18 * i, place)
     return _PLOT_HEIGHT + _BOTTOM + 18 * len(chart.series), lines
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from neuralq.apps.pages.page import Cell, Chart, Drawing, Grid, Series
+from neuralq.apps.pages.page import Chart, Drawing, GridDrawing, Series, Square
 
 __all__ = ["ARROWS", "drawing_lines", "shown"]
 
@@ -27,18 +27,18 @@ def drawing_lines(drawing: Drawing) -> list[str]:
     r"""A grid as boxes, a chart as one row of bars per curve, under its title.
 
     Example:
-        >>> print("\n".join(drawing_lines(Grid("two cells", 2, (Cell("9"), Cell("G"))))))
+        >>> print("\n".join(drawing_lines(GridDrawing("two cells", 2, (Square("9"), Square("G"))))))
         two cells
         ┌───────┬───────┐
         │   9   │   G   │
         └───────┴───────┘
     """
-    if isinstance(drawing, Grid):
+    if isinstance(drawing, GridDrawing):
         return [drawing.title, *_grid_lines(drawing)]
     return [drawing.title, *_chart_lines(drawing)]
 
 
-def _grid_lines(grid: Grid) -> list[str]:
+def _grid_lines(grid: GridDrawing) -> list[str]:
     valued = any(arrow.text for cell in grid.cells for arrow in cell.arrows)
     blocks = [_valued_block(cell) if valued else _plain_block(cell) for cell in grid.cells]
     width = max(7, max(len(line) for block in blocks for line in block) + 2)
@@ -61,12 +61,12 @@ def _grid_lines(grid: Grid) -> list[str]:
     return [*lines, rule("└", "┴", "┘")]
 
 
-def _plain_block(cell: Cell) -> list[str]:
+def _plain_block(cell: Square) -> list[str]:
     arrows = "".join(ARROWS[arrow.direction] for arrow in cell.arrows)
     return [f"{cell.label} {arrows}" if arrows else cell.label]
 
 
-def _valued_block(cell: Cell) -> list[str]:
+def _valued_block(cell: Square) -> list[str]:
     """North above, west and east beside the label, south below; a star marks the best."""
     sides = {arrow.direction: f"{ARROWS[arrow.direction]}{arrow.text}{'*' * arrow.best}" for arrow in cell.arrows}
     size = max((len(side) for direction, side in sides.items() if direction % 2), default=0)
