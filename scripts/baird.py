@@ -30,9 +30,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from neuralq.apps.pages.star import divergence_svg
 from neuralq.checks import MissingExtra
 from neuralq.lab import predict_baird, run_baird
-from neuralq.runs.report import divergence_svg
 from neuralq_envs.counterexamples.baird import critical_gamma
 
 

@@ -22,17 +22,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from neuralq.apps.pages import star
+from neuralq.apps.pages.star import divergence_svg, growth_table, values_table, write_demo_report
 from neuralq.checks import MissingExtra
 from neuralq.runs.folder.files import RunFolderError
-from neuralq.runs.report import divergence as divergence_module
 from neuralq.runs.report import (
-    divergence_svg,
-    growth_table,
     learning_curve_svg,
     read_rows,
     signals_svg,
-    values_table,
-    write_demo_report,
     write_report,
 )
 from neuralq.runs.report.readings import finite_series, first_not_finite, quartiles, thin
@@ -279,11 +276,11 @@ def test_a_torn_last_line_is_forgiven_and_a_torn_middle_line_named(tmp_path: Pat
 def test_the_prediction_starts_at_the_first_error_and_multiplies_every_step() -> None:
     # e₀ = 2, g = 1.5, steps 3, 4, 6: 2, 3, 6.75
     steps = np.array([3, 4, 6])
-    drawn = divergence_module._predicted(result(growth=1.5, steps=steps, rmsve=np.array([2.0, 9.0, 9.0])))
+    drawn = star._predicted(result(growth=1.5, steps=steps, rmsve=np.array([2.0, 9.0, 9.0])))
     np.testing.assert_allclose(drawn, [2.0, 3.0, 6.75], rtol=1e-12)
-    counted = divergence_module._predicted(result(growth=1.5, steps=2, rmsve=np.array([2.0, 9.0, 9.0])))
+    counted = star._predicted(result(growth=1.5, steps=2, rmsve=np.array([2.0, 9.0, 9.0])))
     np.testing.assert_allclose(counted, [2.0, 3.0, 4.5], rtol=1e-12)  # only their number: before and after each sweep
-    far = divergence_module._predicted(result(growth=10.0, steps=np.array([0, 100, 900]), rmsve=np.ones(3)))
+    far = star._predicted(result(growth=10.0, steps=np.array([0, 100, 900]), rmsve=np.ones(3)))
     np.testing.assert_allclose(far[:2], [1.0, 1e100])
     assert math.isnan(far[2])
 

@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.pages.star import write_demo_report
 from neuralq.lab import BairdPrediction, BairdResult, predict_baird, run_baird
 from neuralq.runs import Run, RunConfig, preset_for, train
 from neuralq.runs.folder.run_folder import is_run_folder, read_metrics
 from neuralq.runs.hooks import ProgressBar
 from neuralq.runs.recipe.config import config_from_dict
-from neuralq.runs.report import write_demo_report
 
 __all__ = ["baird", "demo", "plain_star", "show_star"]
 

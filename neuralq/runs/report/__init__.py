@@ -6,23 +6,16 @@ Drawing needs the extra ``plot`` (matplotlib), which is imported when the first 
 from __future__ import annotations
 
 from neuralq.runs.report.curves import learning_curve_svg, signals_svg
-from neuralq.runs.report.demo import write_demo_report
-from neuralq.runs.report.divergence import DivergenceResult, divergence_svg, growth_table, values_table
 from neuralq.runs.report.page import Page
 from neuralq.runs.folder.files import read_rows
 from neuralq.runs.report.run import write_report
 from neuralq.checks import MissingExtra
 
 __all__ = [
-    "DivergenceResult",
     "MissingExtra",
     "Page",
-    "divergence_svg",
-    "growth_table",
     "learning_curve_svg",
     "read_rows",
     "signals_svg",
-    "values_table",
-    "write_demo_report",
     "write_report",
 ]
