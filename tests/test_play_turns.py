@@ -17,7 +17,7 @@ import pytest
 from backgammon_slowly import row
 
 pytest.importorskip("starlette", reason="the extra web is not installed")
-from neuralq.apps.web.play_turns import BAR, OFF, PartialTurn, Step, WaysToPlay, notation
+from neuralq.apps.web.play_turns import BAR, OFF, CheckerStep, PartialTurn, WaysToPlay, notation
 from neuralq_envs.backgammon import Position
 
 Side = tuple[int, ...]  # checkers on the points 1 to 24 at 1 to 24 and on the bar at 25; at 0 those that are off
@@ -198,9 +198,15 @@ def test_one_move_of_two_steps_where_one_order_hits_is_left_to_two_moves() -> No
 
 
 def test_turns_as_players_write_them() -> None:
-    assert notation([Step(25, 20, 5, True), Step(13, 8, 5, False), Step(13, 8, 5, False)]) == "bar/20* 13/8(2)"
-    assert notation([Step(13, 8, 5, False), Step(24, 19, 5, False), Step(8, 3, 5, True)]) == "24/19 13/3*"
-    assert notation([Step(4, 0, 6, False), Step(4, 0, 6, False)]) == "4/off(2)"
+    assert (
+        notation([CheckerStep(25, 20, 5, True), CheckerStep(13, 8, 5, False), CheckerStep(13, 8, 5, False)])
+        == "bar/20* 13/8(2)"
+    )
+    assert (
+        notation([CheckerStep(13, 8, 5, False), CheckerStep(24, 19, 5, False), CheckerStep(8, 3, 5, True)])
+        == "24/19 13/3*"
+    )
+    assert notation([CheckerStep(4, 0, 6, False), CheckerStep(4, 0, 6, False)]) == "4/off(2)"
 
 
 @pytest.mark.parametrize(

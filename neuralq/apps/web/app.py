@@ -22,16 +22,14 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.routing import Route
 
 from neuralq.apps.web.catalogue import catalogue
 from neuralq.apps.web.pool import Busy, Left, Pool, TooLong
 from neuralq.apps.web.requests import ANSWERS, read_request
-from neuralq.apps.web.shell import Guard, Malformed, failure, http_error, read_body, read_json
+from neuralq.apps.web.shell import read_body, read_json, refusal, site
 
 __all__ = ["application"]
 
@@ -40,21 +38,13 @@ _STATIC = Path(__file__).parent / "static"
 _MOST_REMEMBERED = 256
 
 
-def application(names: frozenset[str], *, any_address: bool, plotly_script: Path) -> Starlette:
-    """The application.
-
-    Args:
-        names: hosts that it answers to, in lower case.
-        any_address: whether it answers to every address given as a number as well.
-        plotly_script: plotly's script.
+def application(host: str, plotly_script: Path) -> Starlette:
+    """The application, to be served on ``host``.
 
     Example:
-        >>> application(frozenset({"localhost"}), any_address=False, plotly_script=Path("plotly.min.js")).debug
+        >>> application("localhost", Path("plotly.min.js")).debug
         False
     """
-
-    async def page(request: Request) -> Response:
-        return FileResponse(_STATIC / "index.html")
 
     async def script(request: Request) -> Response:
         return FileResponse(plotly_script, media_type="text/javascript")
@@ -62,18 +52,9 @@ def application(names: frozenset[str], *, any_address: bool, plotly_script: Path
     async def chosen(request: Request) -> Response:
         return JSONResponse(await run_in_threadpool(catalogue))
 
-    return Starlette(
-        routes=[
-            Route("/", page),
-            Route("/plotly.min.js", script),
-            Route("/api/lab", chosen),
-            *(Route(f"/api/{kind}", _answer, methods=["POST"]) for kind in ANSWERS),
-            Mount("/static", StaticFiles(directory=_STATIC)),
-        ],
-        middleware=[Middleware(Guard, names=names, any_address=any_address)],
-        exception_handlers={HTTPException: http_error, Exception: failure},
-        lifespan=_lifespan,
-    )
+    answers = (Route(f"/api/{kind}", _answer, methods=["POST"]) for kind in ANSWERS)
+    routes = [Route("/plotly.min.js", script), Route("/api/lab", chosen), *answers]
+    return site(_STATIC, "index.html", routes, host, _lifespan)
 
 
 @asynccontextmanager
@@ -94,10 +75,8 @@ async def _answer(request: Request) -> Response:
     kind = request.url.path.rpartition("/")[2]
     try:
         spec = read_request(kind, read_json(await read_body(request)))
-    except Malformed as error:
-        raise HTTPException(400, str(error)) from None
     except ValueError as error:
-        raise HTTPException(422, str(error)) from None
+        raise refusal(error) from None
     known: OrderedDict[str, Response] = request.app.state.remembered
     key = f"{kind} {spec}"
     if key not in known:

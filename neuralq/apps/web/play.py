@@ -16,24 +16,21 @@ import secrets
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 
 from neuralq.apps.web.play_requests import check_fields, point_of, seed_of
-from neuralq.apps.web.shell import Guard, Malformed, failure, http_error, read_body, read_json
+from neuralq.apps.web.shell import read_body, read_json, refusal, site
 
-__all__ = ["MOST_SEATS", "Action", "Game", "Gone", "Offer", "Outdated", "Seats", "actions_of", "play_application"]
+__all__ = ["MOST_SEATS", "Action", "Game", "Gone", "Offer", "Outdated", "Seats", "play_application"]
 
 MOST_SEATS = 200
 """Of more seats the one that was left alone longest is given up."""
@@ -43,10 +40,6 @@ _STATIC = Path(__file__).parent / "static" / "play"
 
 class Game(Protocol):
     """What sits at a seat."""
-
-    @property
-    def revision(self) -> int:
-        """How often the state has changed."""
 
     def new(self, given: Mapping[str, Any]) -> None:
         """A new game."""
@@ -78,7 +71,7 @@ class Offer:
         page: the page's file.
         make: a game, whose draws are the generator's.
         new: what `Game.new` takes.
-        actions: what else can be done, by name; ``new`` and ``state`` can be done everywhere.
+        actions: what else can be done, by name.
     """
 
     page: str
@@ -90,9 +83,28 @@ class Offer:
 class Gone(LookupError):
     """There is no such seat."""
 
+    status = 404
+
 
 class Outdated(RuntimeError):
     """The state has changed since it was shown."""
+
+    status = 409
+
+
+@dataclass(slots=True)
+class _Seat:
+    """A game, how often its state has changed, and the lock of who acts there."""
+
+    game: Game
+    revision: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def do(self, action: Action, given: Mapping[str, Any]) -> dict[str, Any]:
+        """What the action answers, or the state after it."""
+        answer = action.run(self.game, given)
+        self.revision += action.changes
+        return {"revision": self.revision, **self.game.state()} if answer is None else answer
 
 
 class Seats:
@@ -101,6 +113,9 @@ class Seats:
     Args:
         offer: what is played.
         most: how many are kept.
+
+    Attributes:
+        actions: everything that can be done at a seat, by name.
 
     Example:
         >>> from neuralq.apps.web.play_tictactoe import tictactoe
@@ -112,9 +127,10 @@ class Seats:
 
     def __init__(self, offer: Offer, most: int = MOST_SEATS) -> None:
         self._offer = offer
-        self._actions = actions_of(offer)
+        new = Action(lambda game, given: game.new(given), offer.new)
+        self.actions = {"new": new, "state": Action(lambda game, given: None, changes=False), **offer.actions}
         self._most = most
-        self._taken: OrderedDict[str, tuple[Game, threading.Lock]] = OrderedDict()
+        self._taken: OrderedDict[str, _Seat] = OrderedDict()
         self._lock = threading.Lock()
 
     def start(self, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -124,14 +140,14 @@ class Seats:
             ValueError: a field that is not there, or means nothing.
         """
         check_fields(given, ("seed", *self._offer.new))
-        game = self._offer.make(np.random.default_rng(seed_of(given)))
-        game.new(given)
-        seat = secrets.token_urlsafe(16)
+        seat = _Seat(self._offer.make(np.random.default_rng(seed_of(given))))
+        state = seat.do(self.actions["new"], given)
+        token = secrets.token_urlsafe(16)
         with self._lock:
-            self._taken[seat] = (game, threading.Lock())
+            self._taken[token] = seat
             while len(self._taken) > self._most:
                 self._taken.popitem(last=False)
-        return {"seat": seat, **game.state()}
+        return {"seat": token, **state}
 
     def act(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
         """Does something at the seat that ``given`` names.
@@ -141,56 +157,29 @@ class Seats:
             Gone: there is no such seat.
             Outdated: the game has gone on since.
         """
-        action = self._actions[name]
-        seat = given.get("seat")
+        action = self.actions[name]
+        token = given.get("seat")
         with self._lock:
-            if not isinstance(seat, str) or seat not in self._taken:
+            if not isinstance(token, str) or token not in self._taken:
                 raise Gone("there is no such game here, the server may have been started anew; start a new game")
-            self._taken.move_to_end(seat)
-            game, lock = self._taken[seat]
+            self._taken.move_to_end(token)
+            seat = self._taken[token]
         check_fields(given, ("seat", "revision", *action.fields))
-        with lock:
-            if action.changes and point_of(given, "revision", 0, 2**53) != game.revision:
+        with seat.lock:
+            if action.changes and point_of(given, "revision", 0, 2**53) != seat.revision:
                 raise Outdated("the game has gone on meanwhile, perhaps in another tab; this is how it stands")
-            answer = action.run(game, given)
-            return {"seat": seat, **(game.state() if answer is None else answer)}
+            return {"seat": token, **seat.do(action, given)}
 
 
-def actions_of(offer: Offer) -> dict[str, Action]:
-    """Everything that can be done at a seat, by name.
-
-    Example:
-        >>> from neuralq.apps.web.play_tictactoe import tictactoe
-        >>> list(actions_of(tictactoe()))
-        ['new', 'state', 'move', 'undo']
-    """
-
-    def new(game: Game, given: Mapping[str, Any]) -> None:
-        game.new(given)
-
-    def state(game: Game, given: Mapping[str, Any]) -> dict[str, Any]:
-        return game.state()
-
-    return {"new": Action(new, offer.new), "state": Action(state, changes=False), **offer.actions}
-
-
-def play_application(offer: Offer, names: frozenset[str], *, any_address: bool) -> Starlette:
-    """The page of a game and its API.
-
-    Args:
-        offer: the game.
-        names: hosts that it answers to, in lower case.
-        any_address: whether it answers to every address given as a number as well.
+def play_application(offer: Offer, host: str) -> Starlette:
+    """The page of a game and its API, to be served on ``host``.
 
     Example:
         >>> from neuralq.apps.web.play_tictactoe import tictactoe
-        >>> play_application(tictactoe(), frozenset({"localhost"}), any_address=False).debug
+        >>> play_application(tictactoe(), "localhost").debug
         False
     """
     seats = Seats(offer)
-
-    async def page(request: Request) -> Response:
-        return FileResponse(_STATIC / offer.page)
 
     async def start(request: Request) -> Response:
         return await _answered(request, seats.start)
@@ -198,16 +187,8 @@ def play_application(offer: Offer, names: frozenset[str], *, any_address: bool) 
     async def act(request: Request) -> Response:
         return await _answered(request, functools.partial(seats.act, request.url.path.rpartition("/")[2]))
 
-    return Starlette(
-        routes=[
-            Route("/", page),
-            Route("/api/start", start, methods=["POST"]),
-            *(Route(f"/api/{name}", act, methods=["POST"]) for name in actions_of(offer)),
-            Mount("/static", StaticFiles(directory=_STATIC)),
-        ],
-        middleware=[Middleware(Guard, names=names, any_address=any_address)],
-        exception_handlers={HTTPException: http_error, Exception: failure},
-    )
+    routes = [Route(f"/api/{name}", act, methods=["POST"]) for name in seats.actions]
+    return site(_STATIC, offer.page, [Route("/api/start", start, methods=["POST"]), *routes], host)
 
 
 async def _answered(request: Request, what: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Response:
@@ -215,11 +196,5 @@ async def _answered(request: Request, what: Callable[[Mapping[str, Any]], dict[s
     try:
         given = read_json(await read_body(request))
         return JSONResponse(await run_in_threadpool(what, given))
-    except Malformed as error:
-        raise HTTPException(400, str(error)) from None
-    except Gone as error:
-        raise HTTPException(404, str(error)) from None
-    except Outdated as error:
-        raise HTTPException(409, str(error)) from None
-    except ValueError as error:
-        raise HTTPException(422, str(error)) from None
+    except (ValueError, Gone, Outdated) as error:
+        raise refusal(error) from None

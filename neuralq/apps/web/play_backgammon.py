@@ -16,7 +16,7 @@ import numpy as np
 
 from neuralq.apps.web.play import Action, Offer
 from neuralq.apps.web.play_requests import dice_of, point_of, position_of
-from neuralq.apps.web.play_turns import BAR, PartialTurn, Step, WaysToPlay, notation, point_name
+from neuralq.apps.web.play_turns import BAR, CheckerStep, PartialTurn, WaysToPlay, notation, point_name
 from neuralq.systems.backgammon import BackgammonAgent, RankedTurn
 from neuralq_envs.backgammon import Position
 
@@ -52,7 +52,6 @@ class BackgammonGame:
         self._rng = rng
         self._score = [0, 0]
         self._num_games = 0
-        self._revision = 0
         self._position = Position.initial()  # as the turn began; of the side to move
         self._turn: PartialTurn | None = None  # None when the game is over
         self._is_set_up = False
@@ -60,11 +59,6 @@ class BackgammonGame:
         self._agent_turn: dict[str, Any] | None = None
         self._ranked: list[RankedTurn] | None = None  # of the visitor's roll, once somebody has asked
         self._shown: tuple[bytes, list[dict[str, Any]]] = (b"", [])  # the board before, and the steps since
-
-    @property
-    def revision(self) -> int:
-        """How often the state has changed."""
-        return self._revision
 
     def new(self, given: Mapping[str, Any]) -> None:
         """A new game from the beginning, or from ``position`` with the visitor to play ``dice``.
@@ -80,20 +74,17 @@ class BackgammonGame:
         self._is_set_up = position is not None
         self._record, self._agent_turn = [], None
         self._num_games += 1
-        self._revision += 1
-        if position is not None:
-            self._begin_turn(position, _sorted(dice) if dice else self._next_roll())
-            self._shown = (self._board(), [])
-            return
-        opening = self._rolled()
-        while opening[0] == opening[1]:  # each throws one die, again if they are equal; the higher begins
-            opening = self._rolled()
-        start, opening = Position.initial(_YOU if opening[0] > opening[1] else _AGENT), _sorted(opening)
-        if start.turn == _YOU:
-            self._begin_turn(start, opening)
+        if position is None:
+            dice = self._rolled()
+            while dice[0] == dice[1]:  # each throws one die, again if they are equal; the higher begins
+                dice = self._rolled()
+            position = Position.initial(_YOU if dice[0] > dice[1] else _AGENT)
+        dice = _sorted(dice or self._rolled())
+        if position.turn == _YOU:
+            self._begin_turn(position, dice)
             self._shown = (self._board(), [])
         else:
-            self._answer(start, opening)
+            self._answer(position, dice)
 
     def move(self, given: Mapping[str, Any]) -> None:
         """Moves a checker of the visitor's from ``source`` to ``target``.
@@ -105,7 +96,6 @@ class BackgammonGame:
         before = self._board()
         steps = self._going_on().move(source, target)
         self._shown = (before, [_plain(step, _YOU) for step in steps])
-        self._revision += 1
 
     def undo(self, given: Mapping[str, Any]) -> None:
         """Takes the visitor's last move of this turn back.
@@ -115,7 +105,6 @@ class BackgammonGame:
         """
         self._going_on().undo()
         self._shown = (self._board(), [])
-        self._revision += 1
 
     def confirm(self, given: Mapping[str, Any]) -> None:
         """Ends the visitor's turn; the agent rolls and plays, and the visitor's next roll is drawn.
@@ -129,11 +118,10 @@ class BackgammonGame:
             raise ValueError(f"the turn is not complete: {dice} can still be played")
         self._keep_record(turn)
         after = Position(turn.board[25:], turn.board[:25], _AGENT)
-        self._revision += 1
         if after.winner is not None:
             self._finish(after)
         else:
-            self._answer(after, self._next_roll())
+            self._answer(after, _sorted(self._rolled()))
 
     def hint(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The best ways to play the visitor's roll, from how the turn began.
@@ -151,7 +139,6 @@ class BackgammonGame:
         left = [] if turn is None else list(turn.dice_left)
         moves = {} if turn is None else turn.moves()
         return {
-            "revision": self._revision,
             "num_games": self._num_games,
             "score": dict(zip(_NAMES, self._score, strict=True)),
             "counts": not self._is_set_up,
@@ -174,9 +161,6 @@ class BackgammonGame:
         die_1, die_2 = self._rng.integers(1, 7, 2).tolist()
         return die_1, die_2
 
-    def _next_roll(self) -> tuple[int, int]:
-        return _sorted(self._rolled())
-
     def _begin_turn(self, position: Position, dice: tuple[int, int]) -> None:
         """The visitor's turn."""
         self._position = position
@@ -196,22 +180,16 @@ class BackgammonGame:
         if after.winner is not None:
             self._finish(after)
         else:
-            self._begin_turn(after, self._next_roll())
+            self._begin_turn(after, _sorted(self._rolled()))
 
     def _keep_record(self, turn: PartialTurn) -> None:
         """What the visitor played, and what the agent thinks of it."""
-        entry: dict[str, Any] = {
-            "who": "you",
-            "dice": list(turn.ways.dice),
-            "text": notation(turn.steps),
-            "rank": None,
-            "loss": None,
-        }
-        ranking = self._ranking()
+        rank, loss, ranking = None, None, self._ranking()
         for i, one in enumerate(ranking):
             if one.position.other + one.position.own == turn.board:
-                entry |= {"rank": i + 1, "loss": max(0.0, ranking[0].equity - one.equity)}
-        self._record.append(entry)
+                rank, loss = i + 1, max(0.0, ranking[0].equity - one.equity)
+        text = notation(turn.steps)
+        self._record.append({"who": "you", "dice": list(turn.ways.dice), "text": text, "rank": rank, "loss": loss})
 
     def _ranking(self) -> list[RankedTurn]:
         if self._ranked is None:
@@ -329,7 +307,7 @@ def _rows(ranked: Sequence[RankedTurn], ways: WaysToPlay) -> list[dict[str, Any]
     ]
 
 
-def _plain(step: Step, who: int) -> dict[str, Any]:
+def _plain(step: CheckerStep, who: int) -> dict[str, Any]:
     """A step by the visitor's numbers, for the page to draw; ``bar`` and ``off`` are the mover's own."""
 
     def seen(point: int) -> int | str:

@@ -43,16 +43,10 @@ class TicTacToeGame:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._revision = 0
         self._player = 1  # X
         self._boards: list[Marks] = [np.zeros(9, np.int8)]  # those in which the visitor has been to move, and the last
         self._score = {"you": 0, "draws": 0, "opponent": 0}
         self._result: dict[str, Any] | None = None
-
-    @property
-    def revision(self) -> int:
-        """How often the state has changed."""
-        return self._revision
 
     def new(self, given: Mapping[str, Any]) -> None:
         """A new game, as ``player`` X, who begins, or O.
@@ -64,7 +58,6 @@ class TicTacToeGame:
         board = np.zeros(9, np.int8)
         self._boards = [board if self._player == 1 else self._answered(board)]
         self._result = None
-        self._revision += 1
 
     def move(self, given: Mapping[str, Any]) -> None:
         """Marks ``cell``, 0 to 8 row by row; the opponent answers.
@@ -83,7 +76,6 @@ class TicTacToeGame:
         self._boards.append(board)
         if _is_over(board):
             self._finish(board)
-        self._revision += 1
 
     def undo(self, given: Mapping[str, Any]) -> None:
         """Takes back the visitor's last move and the answer to it; a result that had been counted is taken off.
@@ -97,14 +89,12 @@ class TicTacToeGame:
             self._score[self._result["winner"] or "draws"] -= 1
             self._result = None
         self._boards.pop()
-        self._revision += 1
 
     def state(self) -> dict[str, Any]:
         """Everything that the page shows."""
         board = self._boards[-1]
         over = self._result is not None
         return {
-            "revision": self._revision,
             "player": _SIGNS[self._player],
             "cells": [_SIGNS[int(mark)] for mark in board],
             "values": [None if over or board[cell] else self._value(_marked(board, cell)) for cell in range(9)],

@@ -21,7 +21,7 @@ from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.position import check_dice
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, afterstates, is_legal, play
 
-__all__ = ["BAR", "OFF", "PartialTurn", "Step", "WaysToPlay", "notation", "point_name"]
+__all__ = ["BAR", "OFF", "CheckerStep", "PartialTurn", "WaysToPlay", "notation", "point_name"]
 
 OFF = 0
 BAR = 25
@@ -30,7 +30,7 @@ _Place = tuple[bytes, tuple[int, ...]]  # a board, own row first, and the dice t
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class CheckerStep:
     """One checker moved by one die.
 
     Args:
@@ -71,7 +71,7 @@ class WaysToPlay:
         self._next = self._grown()
         self._kept: dict[_Place, bool] = {}
 
-    def steps(self, place: _Place) -> dict[Step, _Place]:
+    def steps(self, place: _Place) -> dict[CheckerStep, _Place]:
         """The steps that may come next, each with where it leads; none if the turn ends here.
 
         Example:
@@ -81,7 +81,7 @@ class WaysToPlay:
         """
         return {step: after for step, after in self._next[place].items() if self._can_end(after)}
 
-    def paths(self) -> dict[bytes, tuple[Step, ...]]:
+    def paths(self) -> dict[bytes, tuple[CheckerStep, ...]]:
         """For each board in which the turn can end, own row first, one way to get there.
 
         Example:
@@ -89,8 +89,8 @@ class WaysToPlay:
             >>> len(ways.paths()) == len(Position.initial().afterstates((1, 1)))
             True
         """
-        found: dict[bytes, tuple[Step, ...]] = {}
-        reached: dict[_Place, tuple[Step, ...]] = {self.start: ()}
+        found: dict[bytes, tuple[CheckerStep, ...]] = {}
+        reached: dict[_Place, tuple[CheckerStep, ...]] = {self.start: ()}
         frontier = [self.start]
         for place in frontier:  # grows while it is read
             following = self.steps(place)
@@ -102,9 +102,9 @@ class WaysToPlay:
                     frontier.append(after)
         return found
 
-    def _grown(self) -> dict[_Place, dict[Step, _Place]]:
+    def _grown(self) -> dict[_Place, dict[CheckerStep, _Place]]:
         """Every place that single steps lead to, whether or not the turn may go that way."""
-        found: dict[_Place, dict[Step, _Place]] = {}
+        found: dict[_Place, dict[CheckerStep, _Place]] = {}
         frontier = [self.start]
         for place in frontier:  # grows while it is read
             if place in found:
@@ -139,10 +139,10 @@ class PartialTurn:
     def __init__(self, ways: WaysToPlay) -> None:
         self.ways = ways
         self._places = [ways.start]
-        self._moves: list[tuple[Step, ...]] = []
+        self._moves: list[tuple[CheckerStep, ...]] = []
 
     @property
-    def steps(self) -> tuple[Step, ...]:
+    def steps(self) -> tuple[CheckerStep, ...]:
         """What has been played so far."""
         return tuple(step for move in self._moves for step in move)
 
@@ -166,18 +166,18 @@ class PartialTurn:
         """Whether nothing more can be played."""
         return not self.ways.steps(self._places[-1])
 
-    def moves(self) -> dict[int, dict[int, tuple[Step, ...]]]:
+    def moves(self) -> dict[int, dict[int, tuple[CheckerStep, ...]]]:
         """The steps of every legal move, by source and target.
 
         Several steps of one checker are one move where the order of the dice makes no difference; where it does (one
         order may hit) they are left to be made one by one. Of two dice that bear a checker off, the smaller is used.
         """
-        found: dict[int, dict[int, tuple[Step, ...]]] = {}
+        found: dict[int, dict[int, tuple[CheckerStep, ...]]] = {}
         for source in {step.source for step in self.ways.steps(self._places[-1])}:
             found[source] = self._targets(source)
         return dict(sorted(found.items(), reverse=True))
 
-    def move(self, source: int, target: int) -> tuple[Step, ...]:
+    def move(self, source: int, target: int) -> tuple[CheckerStep, ...]:
         """Moves a checker, and returns its steps.
 
         Raises:
@@ -198,7 +198,7 @@ class PartialTurn:
         self._places.append(place)
         return steps
 
-    def undo(self) -> tuple[Step, ...]:
+    def undo(self) -> tuple[CheckerStep, ...]:
         """Takes the last move back, and returns its steps.
 
         Raises:
@@ -214,12 +214,12 @@ class PartialTurn:
         self._places.pop()
         return self._moves.pop()
 
-    def _targets(self, source: int) -> dict[int, tuple[Step, ...]]:
+    def _targets(self, source: int) -> dict[int, tuple[CheckerStep, ...]]:
         """Where the checker can go, the fewest steps first."""
-        found: dict[int, tuple[Step, ...]] = {}
-        frontier: list[tuple[int, _Place, tuple[Step, ...]]] = [(source, self._places[-1], ())]
+        found: dict[int, tuple[CheckerStep, ...]] = {}
+        frontier: list[tuple[int, _Place, tuple[CheckerStep, ...]]] = [(source, self._places[-1], ())]
         while frontier:
-            reached: dict[int, list[tuple[_Place, tuple[Step, ...]]]] = {}
+            reached: dict[int, list[tuple[_Place, tuple[CheckerStep, ...]]]] = {}
             for point, place, path in frontier:
                 for step, after in self.ways.steps(place).items():
                     if step.source == point:
@@ -252,16 +252,17 @@ class PartialTurn:
         return f"no way leads there with the dice that are left ({dice}); if orders differ, move one die at a time"
 
 
-def notation(steps: Sequence[Step]) -> str:
+def notation(steps: Sequence[CheckerStep]) -> str:
     """The steps as players write them: ``24/18*/13 6/5(2)``; a star is a hit, and a number counts equal moves.
 
     Example:
-        >>> notation([Step(6, 5, 1, False), Step(6, 5, 1, False), Step(13, 7, 6, True), Step(7, 6, 1, False)])
+        >>> twice, hit = CheckerStep(6, 5, 1, False), CheckerStep(13, 7, 6, True)
+        >>> notation([twice, twice, hit, CheckerStep(7, 6, 1, False)])
         '13/7*/6 6/5(2)'
         >>> notation([])
         'no move'
     """
-    chains: list[list[Step]] = []
+    chains: list[list[CheckerStep]] = []
     for step in steps:
         longer = next((chain for chain in chains if chain[-1].target == step.source), None)
         if longer is None:
@@ -286,7 +287,7 @@ def point_name(point: int) -> str:
     return {BAR: "bar", OFF: "off"}.get(point, str(point))
 
 
-def _chain_text(chain: Sequence[Step]) -> str:
+def _chain_text(chain: Sequence[CheckerStep]) -> str:
     """What one checker did; points that it only passed are left out."""
     parts = [point_name(chain[0].source)]
     for i, step in enumerate(chain):
@@ -303,11 +304,11 @@ def _ends(position: Position, dice: tuple[int, int]) -> frozenset[bytes]:
     return frozenset(rows[i : i + 50] for i in range(0, 50 * count, 50))
 
 
-def _single_steps(place: _Place) -> dict[Step, _Place]:
+def _single_steps(place: _Place) -> dict[CheckerStep, _Place]:
     """What the rules allow for one checker and one of the dice that are left."""
     rows, left = place
     board = np.frombuffer(rows, np.int8).reshape(2, 25).copy()
-    found: dict[Step, _Place] = {}
+    found: dict[CheckerStep, _Place] = {}
     for die in dict.fromkeys(left):
         rest = list(left)
         rest.remove(die)
@@ -315,6 +316,6 @@ def _single_steps(place: _Place) -> dict[Step, _Place]:
             if rows[source] and is_legal(board, source, die):
                 after = board.copy()
                 hit = bool(play(after, source, die))
-                step = Step(source + 1, max(source + 1 - die, OFF), die, hit)
+                step = CheckerStep(source + 1, max(source + 1 - die, OFF), die, hit)
                 found[step] = (after.tobytes(), tuple(rest))
     return found

@@ -47,8 +47,7 @@ def lab_app(host: str = "127.0.0.1") -> Starlette:
     need("starlette", "plotly")
     from neuralq.apps.web.app import application
 
-    names, any_address = own_names(host)
-    return application(names, any_address=any_address, plotly_script=_plotly_script())
+    return application(host, _plotly_script())
 
 
 def play_app(offer: Offer, host: str = "127.0.0.1") -> Starlette:
@@ -69,8 +68,7 @@ def play_app(offer: Offer, host: str = "127.0.0.1") -> Starlette:
     need("starlette", what="the page to play on")
     from neuralq.apps.web.play import play_application
 
-    names, any_address = own_names(host)
-    return play_application(offer, names, any_address=any_address)
+    return play_application(offer, host)
 
 
 def serve(host: str = "127.0.0.1", port: int = 8765, *, open_browser: bool = False) -> None:

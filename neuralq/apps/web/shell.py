@@ -9,16 +9,23 @@ from __future__ import annotations
 
 import ipaddress
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from starlette.applications import Starlette
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Lifespan, Message, Receive, Scope, Send
 
-__all__ = ["HEADERS", "MAX_BODY_BYTES", "Guard", "Malformed", "failure", "http_error", "read_body", "read_json"]
+from neuralq.apps.web.server import own_names
+
+__all__ = ["HEADERS", "MAX_BODY_BYTES", "Guard", "Malformed", "read_body", "read_json", "refusal", "site"]
 
 MAX_BODY_BYTES = 10_000
 """Larger bodies are refused; the largest sensible one has a few hundred bytes."""
@@ -39,6 +46,8 @@ HEADERS = {
 
 class Malformed(ValueError):
     """The body is no JSON object."""
+
+    status = 400
 
 
 def read_json(body: bytes) -> Mapping[str, Any]:
@@ -96,15 +105,45 @@ async def read_body(request: Request) -> bytes:
     return body
 
 
-async def http_error(request: Request, error: Exception) -> Response:
+def refusal(error: Exception) -> HTTPException:
+    """The answer to what was refused, with the status that the error brings along, or 422."""
+    return HTTPException(getattr(error, "status", 422), str(error))
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
     """``{"error": ...}`` with the status that was raised."""
     assert isinstance(error, HTTPException)
     return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
 
 
-async def failure(request: Request, error: Exception) -> Response:
+async def _failure(request: Request, error: Exception) -> Response:
     """Status 500; what went wrong is for the terminal."""
     return JSONResponse({"error": "the server failed; its terminal says why"}, 500, headers=HEADERS)
+
+
+def site(
+    static: Path, page: str, routes: Sequence[Route], host: str, lifespan: Lifespan[Starlette] | None = None
+) -> Starlette:
+    """An application with a page at ``/``, what it loads under ``/static``, and routes of its own, behind the guard.
+
+    Args:
+        static: folder of what the page loads.
+        page: the page's file in it.
+        routes: its own.
+        host: address that it will be served on.
+        lifespan: what goes on while it is served.
+    """
+
+    async def shown(request: Request) -> Response:
+        return FileResponse(static / page)
+
+    names, any_address = own_names(host)
+    return Starlette(
+        routes=[Route("/", shown), *routes, Mount("/static", StaticFiles(directory=static))],
+        middleware=[Middleware(Guard, names=names, any_address=any_address)],
+        exception_handlers={HTTPException: _http_error, Exception: _failure},
+        lifespan=lifespan,
+    )
 
 
 class Guard:
