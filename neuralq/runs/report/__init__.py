@@ -5,11 +5,11 @@ Drawing needs the extra ``plot`` (matplotlib), which is imported when the first 
 
 from __future__ import annotations
 
+from neuralq.checks import MissingExtra
+from neuralq.runs.folder.files import read_rows
 from neuralq.runs.report.curves import learning_curve_svg, signals_svg
 from neuralq.runs.report.page import Page
-from neuralq.runs.folder.files import read_rows
 from neuralq.runs.report.run import write_report
-from neuralq.checks import MissingExtra
 
 __all__ = [
     "MissingExtra",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from neuralq.runs.report.readings import Row, finite_series, quartiles, thin
 from neuralq.figures import COLOURS, draw_svg, scale_axis, steps_axis, tame
+from neuralq.runs.report.readings import Row, finite_series, quartiles, thin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

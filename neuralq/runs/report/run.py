@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuralq.runs.folder.files import read_json, read_rows
 from neuralq.runs.report.curves import SIGNALS, learning_curve_svg, signals_svg
 from neuralq.runs.report.page import Page, facts_table, flatten
-from neuralq.runs.folder.files import read_json, read_rows
 from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite
 
 __all__ = ["write_report"]
