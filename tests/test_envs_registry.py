@@ -55,7 +55,7 @@ def test_one_file_and_one_line_make_an_environment_with_its_model_its_copies_and
 
 
 def test_what_a_problem_does_not_know_is_refused_by_name(switch: str) -> None:
-    with pytest.raises(TypeError, match="unexpected keyword argument .colour"):
+    with pytest.raises(TypeError, match=r"unexpected keyword argument .colour"):
         gymnasium.make(switch, colour="red")
 
 

@@ -150,6 +150,31 @@ def test_a_tree_shares_nothing_with_its_environment() -> None:
     assert str(encode_env(other)) == str(again) == str(tree)
 
 
+FORMER_NAMES = {
+    "neuralq_envs.rendering.RenderedEnv": "neuralq_envs.drawn.DrawnEnv",
+    "neuralq.mdp.environment.ModelEnv": "neuralq.simulate.ModelEnv",
+    "neuralq.mdp.model.FiniteMDP": "neuralq.mdp.FiniteMDP",
+}
+
+
+def with_former_names(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: with_former_names(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return type(node)(map(with_former_names, node))
+    return FORMER_NAMES.get(node, node) if isinstance(node, str) else node
+
+
+def test_a_tree_that_knows_classes_by_former_names_is_restored() -> None:
+    env, fresh = (gymnasium.make("neuralq/BlockingMaze-v0") for _ in range(2))
+    env.reset(seed=3)
+    ended = play(env, 5, np.random.default_rng(0))[-1]
+    tree = encode_env(env)
+    assert all(name in str(tree) for name in FORMER_NAMES)
+    restore_env(fresh, with_former_names(tree))
+    assert equal(play(fresh, 50, np.random.default_rng(1), ended), play(env, 50, np.random.default_rng(1), ended))
+
+
 def test_the_sampling_of_the_action_space_goes_on_where_it_was() -> None:
     env, fresh = gymnasium.make("CartPole-v1"), gymnasium.make("CartPole-v1")
     env.reset(seed=0)

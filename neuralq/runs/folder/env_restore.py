@@ -79,6 +79,7 @@ def restore_env(env: Any, tree: Mapping[str, Any]) -> None:
 
 _FORMER_NAMES = {
     "neuralq.interact.lanes.Lane": "neuralq.runs.stream.vector_env.SubEnv",
+    "neuralq_envs.drawn.DrawnEnv": "neuralq_envs.rendering.RenderedEnv",
     "neuralq.features.": "neuralq.runs.stream.encoding.",
     "neuralq.recipes.games.": "neuralq.runs.recipe.games.",
     "neuralq.mdp.FiniteMDP": "neuralq.mdp.model.FiniteMDP",
@@ -94,7 +95,7 @@ def _with_present_names(node: Any) -> Any:
         return type(node)(map(_with_present_names, node))
     if isinstance(node, dict):
         return {key: _with_present_names(value) for key, value in node.items()}
-    if isinstance(node, str) and node.startswith("neuralq."):
+    if isinstance(node, str) and node.startswith("neuralq"):
         for former, present in _FORMER_NAMES.items():
             if node.startswith(former):
                 return present + node.removeprefix(former)
