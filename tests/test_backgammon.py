@@ -20,7 +20,6 @@ import pytest
 from backgammon_slowly import Checkers, row, slow_afterstates
 
 from neuralq_envs.backgammon import Position
-from neuralq_envs.backgammon.inputs import mirrored_inputs
 from neuralq_envs.backgammon.rules import (
     MAX_AFTERSTATES,
     ROLL_PROBABILITIES,
@@ -274,6 +273,11 @@ def test_no_turn_found_by_climbing_comes_near_the_size_of_the_buffer() -> None:
     blots = place({point: 1 for point in range(10, 25)})
     counts = [len(blots.afterstates((die, die))) for die in range(1, 7)]
     assert 1000 < max(counts) < MAX_AFTERSTATES == 18 * 17 * 16 * 15 // 24
+
+
+def mirrored_inputs(x: np.ndarray) -> np.ndarray:
+    """The inputs of the same board with the players exchanged: two blocks of 98, and who is to move."""
+    return np.concatenate([x[98:196], x[:98], x[197:], x[196:197]])
 
 
 def test_exchanging_the_players_exchanges_nothing_else() -> None:

@@ -7,7 +7,7 @@ The two players are numbered 0 and 1, and each has 98 inputs, 98 · player + …
 * 96: its checkers on the bar, halved; 97: its checkers borne off, divided by 15;
 
 and 196 + player is 1 for the player to move. Since each player counts its points from its own side, exchanging the
-players exchanges the two blocks and the last two inputs, exactly (`mirrored_inputs`).
+players exchanges the two blocks and the last two inputs, exactly.
 
 Each input that is not zero, but for the last two, needs a checker of its own: so 15 for each player and one are the
 most there can be, and a first layer that adds only these columns does a sixth of the work.
@@ -19,19 +19,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.jit import lean_kernel
 from neuralq_envs.backgammon.rules import BAR, NUM_CHECKERS, Board
 
-__all__ = [
-    "MAX_ACTIVE",
-    "NUM_INPUTS",
-    "mirrored_inputs",
-    "tesauro_dense",
-    "tesauro_sparse",
-]
+__all__ = ["MAX_ACTIVE", "NUM_INPUTS", "tesauro_dense", "tesauro_sparse"]
 
 NUM_INPUTS = 198
 MAX_ACTIVE = 31
@@ -49,6 +42,7 @@ def tesauro_sparse(board: Board, player: int, indices: NDArray[Any], values: NDA
         values: any floats, ``[31]``; written.
 
     Example:
+        >>> import numpy as np
         >>> from neuralq_envs.backgammon.rules import START
         >>> indices, values = np.empty(31, np.int64), np.empty(31)
         >>> count = tesauro_sparse(START, 0, indices, values)
@@ -95,6 +89,7 @@ def tesauro_dense(board: Board, player: int, x: NDArray[Any]) -> None:
         x: any floats, ``[198]``; written.
 
     Example:
+        >>> import numpy as np
         >>> from neuralq_envs.backgammon.rules import START
         >>> x = np.empty(198)
         >>> tesauro_dense(START, 1, x)
@@ -117,22 +112,3 @@ def tesauro_dense(board: Board, player: int, x: NDArray[Any]) -> None:
         x[offset + 96] = board[row, BAR] / 2
         x[offset + 97] = (NUM_CHECKERS - left) / 15
     x[2 * _BLOCK + player] = 1.0
-
-
-def mirrored_inputs(x: NDArray[Any]) -> NDArray[Any]:
-    """The inputs of the same board with the players exchanged, to the bit.
-
-    Args:
-        x: ``[..., 198]``.
-
-    Example:
-        >>> from neuralq_envs.backgammon.rules import START
-        >>> x, y = np.empty(198), np.empty(198)
-        >>> tesauro_dense(START, 0, x), tesauro_dense(START, 1, y)
-        (None, None)
-        >>> np.array_equal(mirrored_inputs(x), y)
-        True
-    """
-    ends = 2 * _BLOCK
-    blocks = [x[..., _BLOCK:ends], x[..., :_BLOCK], x[..., ends + 1 :], x[..., ends : ends + 1]]
-    return np.concatenate(blocks, axis=-1)
