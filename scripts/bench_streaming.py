@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from neuralq.apps.cli.sweeps import SweepBar
+from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs import RunConfig, evaluate_run, with_preset
 from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.recipe.config import config_to_dict
@@ -61,7 +61,7 @@ def measure(env: str, variant: str, seeds: Sequence[int], options: argparse.Name
     config = config_of(env, variant, options.steps)
     with tempfile.TemporaryDirectory() as folder:
         sweep = create_sweep(Path(folder, "sweep"), config_to_dict(config), seeds)
-        with SweepBar(len(seeds)) as bar:
+        with sweep_bar(sweep) as bar:
             result = run_sweep(sweep, command, min(options.workers, len(seeds)), bar)
         missing = [run for run in result.runs if run.state != "finished"]
         if missing:

@@ -199,7 +199,7 @@ def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:
     ("options", "expected"),
     [
         ("--games 0", "--games must be a whole number of at least 1, got 0"),
-        ("--games many", "--games: invalid int value: 'many'"),
+        ("--games many", "--games must be a whole number, got many"),
         ("--hidden", "--hidden: expected one argument"),
         ("--outputs 3", "--outputs must be one of 1, 4, 6, got 3"),
         ("--lambda 1.5", "--lambda must lie in [0, 1], got 1.5"),
@@ -210,9 +210,9 @@ def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:
         ("--mode batched --threads 3", "--batch-games=8 games cannot be shared evenly by --threads=3"),
         ("--against nobody", "--against must be one of 'random', 'pubeval', 'gnubg', got 'nobody'"),
         ("--evaluation-games 1", "--evaluation-games must be a whole number of at least 2"),
-        ("--sparkle 3", "unknown: --sparkle 3"),
+        ("--sparkle 3", "unrecognized arguments: --sparkle 3"),
         ("--config nowhere.json", "cannot read --config nowhere.json"),
-        ("100", "unknown: 100"),
+        ("100", "unrecognized arguments: 100"),
     ],
 )
 def test_bad_options_are_one_clear_error(options: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -245,10 +245,9 @@ def test_commands_for_other_runs_refuse_this_one(tmp_path: Path, capsys: pytest.
 
 
 def test_help_names_every_option_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["train", "td-gammon", "--help"])
+    assert main(["train", "td-gammon", "--help"]) == 0
     shown = capsys.readouterr().out
-    assert ended.value.code == 0 and "neuralq train td-gammon --games 100000 --seed 3" in shown
+    assert "neuralq train td-gammon --games 100000 --seed 3" in shown
     for option in ("games", "hidden", "outputs", "inputs", "mode", "lambda", "lambda-end", "step-size", "threads"):
         assert f"--{option} " in shown
     assert main(["train", "--help"]) == 0 and "neuralq train td-gammon" in capsys.readouterr().out

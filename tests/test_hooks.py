@@ -9,56 +9,67 @@ from __future__ import annotations
 
 import io
 import sys
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from neuralq.apps.cli import main
+from neuralq.apps.cli.progress import ProgressBar, training_bar
 from neuralq.checks import MissingExtra
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
-from neuralq.runs import RunConfig, hooks, train
+from neuralq.runs import RunConfig, train
+from neuralq.runs.control import CONTROL
 from neuralq.runs.folder.run_folder import read_metrics
-from neuralq.runs.hooks import ProgressBar, TensorBoard, own_hook
-
-
-class Clock:
-    """Stands for `time`, so that no test waits."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
+from neuralq.runs.hooks import TensorBoard, own_hook
+from neuralq.runs.kinds import kind_named
+from neuralq.systems.backgammon import TdGammonConfig
 
 
 def row(steps: int, **more: Any) -> dict[str, Any]:
     return {"kind": "train", "env_steps": steps, "steps_per_second": 1234.0, "episode_return": 20.25, **more}
 
 
-def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, stream = Clock(), io.StringIO()
-    monkeypatch.setattr(hooks, "time", clock)
-    with ProgressBar(10_000, 475.0, stream) as bar:
+def run_bar(
+    stream: io.StringIO | None = None, clock: Callable[[], float] = time.monotonic, **config: Any
+) -> ProgressBar[Mapping[str, Any]]:
+    return training_bar(CONTROL, RunConfig(**{"epsilon_end": 0.0, "epsilon_decay_steps": 100, **config}), stream, clock)
+
+
+def test_without_a_terminal_there_is_a_line_every_ten_seconds() -> None:
+    now, stream = [0.0], io.StringIO()
+    config = {"total_steps": 10_000, "stop_at_return": 475.0, "epsilon_decay_steps": 10_000}
+    with run_bar(stream, lambda: now[0], **config) as bar:
         for second in range(25):
-            clock.now = float(second)
+            now[0] = float(second)
             bar(row(100 * second))
             bar({"kind": "evaluation", "env_steps": 100 * second, "greedy_return": 99.5})
     lines = stream.getvalue().splitlines()
     assert lines == [
-        "1,100 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
-        "2,200 steps · 1,234 steps/s · return 20.2 · greedy 99.5 (target 475)",
+        "1,100 of 10,000 steps · 7 s left · 1,234 steps/s · ε 0.89 · return 20.2 · greedy 99.5 (target 475)",
+        "2,200 of 10,000 steps · 6 s left · 1,234 steps/s · ε 0.78 · return 20.2 · greedy 99.5 (target 475)",
     ]
 
 
-def test_exploration_error_and_the_largest_value_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, stream = Clock(), io.StringIO()
-    monkeypatch.setattr(hooks, "time", clock)
-    with ProgressBar(100, stream=stream, epsilon=lambda steps: 1 - steps / 100) as bar:
-        clock.now = 11.0
+def test_exploration_error_and_the_largest_value_are_told() -> None:
+    now, stream = [0.0], io.StringIO()
+    with run_bar(stream, lambda: now[0], total_steps=200_000) as bar:
+        now[0] = 11.0
         bar(row(25, abs_td_error=0.12345, max_q=8.0))
-    assert stream.getvalue() == "25 steps · 1,234 steps/s · ε 0.75 · |δ| 0.123 · max Q 8 · return 20.2\n"
+    told = "25 of 200,000 steps · 3 min left · 1,234 steps/s · ε 0.75 · |δ| 0.123 · max Q 8 · return 20.2\n"
+    assert stream.getvalue() == told
+
+
+def test_games_are_told_as_steps_are() -> None:
+    now, stream = [0.0], io.StringIO()
+    with training_bar(kind_named("td-gammon"), TdGammonConfig(num_games=100), stream, lambda: now[0]) as bar:
+        bar({"kind": "evaluation", "games": 40, "ppg_random": 0.5, "ppg_random_standard_error": 0.01})
+        now[0] = 11.0
+        bar({"kind": "train", "games": 50, "games_per_second": 10.0})
+    assert stream.getvalue() == "50 of 100 games · 5 s left · 10 games/s · random +0.500 ± 0.010\n"
 
 
 OWN = """
@@ -97,14 +108,13 @@ def test_a_hook_of_ones_own(
         own_hook("own_hooks:number")
 
 
-def test_a_row_without_returns_keeps_the_last_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, stream = Clock(), io.StringIO()
-    monkeypatch.setattr(hooks, "time", clock)
-    with ProgressBar(100, stream=stream) as bar:
+def test_a_row_without_returns_keeps_the_last_ones() -> None:
+    now, stream = [0.0], io.StringIO()
+    with run_bar(stream, lambda: now[0], total_steps=100) as bar:
         bar(row(10))
-        clock.now = 11.0
+        now[0] = 11.0
         bar(row(20, episode_return=None))
-    assert stream.getvalue() == "20 steps · 1,234 steps/s · return 20.2\n"
+    assert stream.getvalue() == "20 of 100 steps · 0 s left · 1,234 steps/s · ε 0.8 · return 20.2\n"
 
 
 def test_in_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,23 +125,20 @@ def test_in_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "120")
     stream = Terminal()
-    with ProgressBar(1000, 475.0, stream) as bar:
+    with run_bar(stream, total_steps=1000, stop_at_return=475.0) as bar:
         bar(row(250))
         bar({"kind": "evaluation", "env_steps": 250, "greedy_return": 99.5})
     assert "250/1000" in stream.getvalue() and "1,234 steps/s" in stream.getvalue()
     assert "greedy 99.5 (target 475)" in stream.getvalue()
 
 
-def test_the_bar_is_drawn_on_standard_error(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = Clock()
-    monkeypatch.setattr(hooks, "time", clock)
-    with ProgressBar(100) as bar:
-        clock.now = 11.0
+def test_the_bar_is_drawn_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with run_bar(clock=lambda: now[0]) as bar:
+        now[0] = 11.0
         bar(row(10))
     captured = capsys.readouterr()
-    assert captured.out == "" and "10 steps" in captured.err
+    assert captured.out == "" and "10 of 100,000 steps" in captured.err
 
 
 def test_tensorboard_holds_every_number_at_its_step(tmp_path: Path) -> None:
@@ -166,7 +173,7 @@ def test_hooks_see_every_row_that_is_stored_and_change_nothing(tmp_path: Path) -
         total_steps=96, evaluate_every=40, evaluation_episodes=1, log_every=20, rollout=small, body=MLP((8,))
     )
     seen: list[Any] = []
-    with ProgressBar(96, stream=io.StringIO()) as bar:
+    with training_bar(CONTROL, config, io.StringIO()) as bar:
         watched = train(config, tmp_path / "watched", [bar, lambda row: seen.append(dict(row))])
     assert seen == read_metrics(tmp_path / "watched")
     assert {row["kind"] for row in seen} == {"train", "evaluation"}

@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from neuralq.apps.cli import main, sweeps
-from neuralq.apps.cli.sweeps import SweepBar
+from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
 from neuralq.runs.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
 from neuralq.runs.sweep import processes as processes_module
@@ -256,9 +256,9 @@ def test_a_damaged_summary_is_a_seed_that_has_not_finished(tmp_path: Path) -> No
 # The command line.
 
 
-def test_lines_for_people_and_their_pace() -> None:
+def test_lines_for_people_and_their_pace(tmp_path: Path) -> None:
     out, now = io.StringIO(), [0.0]
-    with SweepBar(3, out, lambda: now[0]) as bar:
+    with sweep_bar(a_sweep(tmp_path, 3), out, lambda: now[0]) as bar:
         for second, status in (
             (0, Status(0, 3000, (0, 1), 0, (), ())),
             (5, Status(500, 3000, (0, 1), 0, (), ())),

@@ -62,7 +62,7 @@ def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[
     kind = kind_of(run_dir)
     if total_steps is not None and kind.budget != "total_steps":
         raise ValueError(
-            f"{run_dir} is a {kind.title} run, whose budget is {kind.budget} and not total_steps; leave it out here, or "
+            f"{run_dir} is {kind.title}, whose budget is {kind.budget} and not total_steps; leave it out here, or "
             "resume the run as its system does"
         )
     return kind.resume(run_dir, total_steps, hooks)

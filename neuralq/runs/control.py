@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
+from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder import checkpoint
@@ -146,9 +148,23 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
             envs.close()
 
 
+def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
+    exploration = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
+    notes = [f"ε {exploration.value(latest['env_steps']):.3g}"]
+    for name, shown in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
+        if name in latest:
+            notes.append(f"{shown} {latest[name]:.3g}")
+    if "episode_return" in latest:
+        notes.append(f"return {latest['episode_return']:.1f}")
+    if "greedy_return" in latest:
+        goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
+        notes.append(f"greedy {latest['greedy_return']:.1f}{goal}")
+    return notes
+
+
 CONTROL = Kind(
     name="control",
-    title="control",
+    title="a run on an environment",
     config=RunConfig,
     budget="total_steps",
     to_plain=config_to_dict,
@@ -159,4 +175,5 @@ CONTROL = Kind(
     plan=plan_of,
     result=_result,
     load=_load_agent,
+    notes=_notes,
 )

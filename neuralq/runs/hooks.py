@@ -1,93 +1,16 @@
-"""Hooks that watch a run: a live progress bar in the terminal, TensorBoard, and Weights & Biases."""
+"""Hooks that watch a run: TensorBoard, Weights & Biases, and the user's own."""
 
 from __future__ import annotations
 
 import importlib
 import secrets
-import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, TextIO, cast
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from typing import Any, cast
 
 from neuralq.checks import MissingExtra
 
-__all__ = ["ProgressBar", "TensorBoard", "WeightsAndBiases", "own_hook"]
-
-_QUIET_SECONDS = 10.0
-"""Where the output is no terminal: one line at most this often."""
-
-
-class ProgressBar:
-    """Steps, rate, time left and returns while a run goes on; plain lines where the output is no terminal.
-
-    Args:
-        total_steps: the run's budget.
-        target: greedy return at which it stops, shown beside the returns.
-        stream: where to draw; standard error by default, so that standard output stays clean.
-        epsilon: exploration at a number of steps, shown beside the rest.
-
-    Example:
-        >>> import io
-        >>> with ProgressBar(100, stream=io.StringIO()) as bar:
-        ...     bar({"kind": "train", "env_steps": 50, "steps_per_second": 10.0, "episode_return": None})
-    """
-
-    def __init__(
-        self,
-        total_steps: int,
-        target: float | None = None,
-        stream: TextIO | None = None,
-        epsilon: Callable[[int], float] | None = None,
-    ) -> None:
-        self._epsilon = epsilon
-        self._console = Console(file=stream or sys.stderr)
-        self._target = target
-        self._latest: dict[str, Any] = {}
-        self._said = time.monotonic()
-        self._bar = Progress(
-            SpinnerColumn(),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[returns]}"),
-            console=self._console,
-            refresh_per_second=4,
-            disable=not self._console.is_terminal,
-        )
-        self._task = self._bar.add_task("training", total=total_steps, rate="", returns="")
-
-    def __enter__(self) -> ProgressBar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
-
-    def __call__(self, row: Mapping[str, Any]) -> None:
-        """Take in a row of metrics."""
-        self._latest.update({k: v for k, v in row.items() if v is not None})
-        latest = self._latest
-        parts = [] if self._epsilon is None else [f"ε {self._epsilon(int(row['env_steps'])):.3g}"]
-        for name, shown in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
-            if name in latest:
-                parts.append(f"{shown} {latest[name]:.3g}")
-        if "episode_return" in latest:
-            parts.append(f"return {latest['episode_return']:.1f}")
-        if "greedy_return" in latest:
-            goal = "" if self._target is None else f" (target {self._target:g})"
-            parts.append(f"greedy {latest['greedy_return']:.1f}{goal}")
-        rate = f"{latest.get('steps_per_second', 0.0):,.0f} steps/s"
-        self._bar.update(self._task, completed=row["env_steps"], rate=rate, returns=" · ".join(parts))
-        if not self._console.is_terminal and time.monotonic() - self._said > _QUIET_SECONDS:
-            self._said = time.monotonic()
-            self._console.print(f"{row['env_steps']:,} steps · {rate} · {' · '.join(parts)}", highlight=False)
-
+__all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
 
 class TensorBoard:
     """Writes every number of every row into TensorBoard event files.

@@ -62,12 +62,33 @@ R = TypeVar("R", bound=Result)
 
 
 @dataclass(frozen=True)
+class CommandLine:
+    """A kind of run on the command line: ``neuralq train NAME`` has an option for each field of its configuration.
+
+    Args:
+        description: what training does, for the help.
+        examples: command lines for the help.
+        short: options whose names are shorter than the fields that they set, by field.
+        measure: "module:function" of the command that evaluates such runs.
+        measures: beginnings and endings of words that ask for that command where no run is named.
+        instead: what to do where a command knows runs on environments only; ``{run}`` stands for the folder.
+    """
+
+    description: str
+    examples: tuple[str, ...]
+    short: Mapping[str, str]
+    measure: str
+    measures: tuple[str, ...]
+    instead: str
+
+
+@dataclass(frozen=True)
 class Kind(Generic[C, T, R]):
     """All that has to be known of a kind of run.
 
     Args:
         name: in `KINDS`.
-        title: for people.
+        title: for people, with its article.
         config: the dataclass that decides a run.
         budget: its field that says how much training.
         to_plain: a configuration as plain values, for JSON.
@@ -78,6 +99,8 @@ class Kind(Generic[C, T, R]):
         plan: when a run is evaluated, saved and stopped.
         result: of a run that has ended; may leave files of its own in the folder.
         load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
+        notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
+        command: what the command line has to know to train by options of the kind's own.
     """
 
     name: str
@@ -92,6 +115,8 @@ class Kind(Generic[C, T, R]):
     plan: Callable[[C], Plan]
     result: Callable[[C, T, Progress, RunFolder], R]
     load: Callable[[Path, bool], Any]
+    notes: Callable[[C, Mapping[str, Any]], list[str]]
+    command: CommandLine | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """Train as configured and leave a run folder: configuration, versions, metrics and checkpoints.
@@ -119,7 +144,7 @@ class Kind(Generic[C, T, R]):
         """
         config = self.from_plain(read_config(run_dir))
         if budget is not None:
-            config = dataclasses.replace(config, **{self.budget: budget})  # type: ignore[type-var]  # a dataclass
+            config = self.with_budget(config, budget)
         with (
             limited_threads(self.num_threads(config)),
             RunFolder.open(run_dir) as folder,
@@ -130,6 +155,10 @@ class Kind(Generic[C, T, R]):
             if budget is not None:
                 folder.replace_config(self.to_plain(config))
             return self._finish(config, trainee, progress, folder, hooks)
+
+    def with_budget(self, config: C, budget: int) -> C:
+        """The same configuration but for how much training there is."""
+        return dataclasses.replace(config, **{self.budget: budget})  # type: ignore[type-var]  # it is a dataclass
 
     def _finish(self, config: C, trainee: T, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]) -> R:
         plan = self.plan(config)

@@ -65,13 +65,8 @@ class Trainee(Protocol):
     """What the loop asks of whatever trains."""
 
     @property
-    def unit(self) -> str:
-        """What training is counted in, as the column of metrics is called: "env_steps" or "games"."""
-        ...
-
-    @property
     def amount(self) -> int:
-        """Units of training so far."""
+        """Training so far, in the plan's unit."""
         ...
 
     @property
@@ -123,9 +118,10 @@ class Trainee(Protocol):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of a run. Amounts are in the unit of what trains.
+    """What is asked of a run.
 
     Args:
+        unit: what training is counted in, as its column of metrics is called: "env_steps", "games".
         budget: how much training.
         evaluate_every: between evaluations.
         checkpoint_every: between checkpoints.
@@ -136,6 +132,7 @@ class Plan:
             the very beginning and ``log_every`` after each other.
     """
 
+    unit: str
     budget: int
     evaluate_every: int
     checkpoint_every: int
@@ -274,7 +271,7 @@ class _Loop:
         row = {
             "kind": kind,
             "env_steps": trainee.env_steps,
-            trainee.unit: trainee.amount,
+            self.plan.unit: trainee.amount,
             "cpu_seconds": progress.cpu_seconds,
             "wall_seconds": progress.wall_seconds,
             **columns,
@@ -295,7 +292,7 @@ class _Loop:
         then, now = self._rate_since, (trainee.amount, time.perf_counter())
         self._rate_since = now
         rate = (now[0] - then[0]) / max(now[1] - then[1], 1e-9)
-        self._record("train", {f"{trainee.unit.removeprefix('env_')}_per_second": rate, **columns})
+        self._record("train", {f"{self.plan.unit.removeprefix('env_')}_per_second": rate, **columns})
 
     def _evaluate(self) -> None:
         self._book()

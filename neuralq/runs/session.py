@@ -57,8 +57,6 @@ class Session:
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
 
-    unit = "env_steps"
-
     @property
     def amount(self) -> int:
         """Environment steps, summed over parallel environments."""

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.systems.backgammon.agent import BackgammonAgent
 from neuralq.systems.backgammon.error_rate import ErrorRate, error_rate
 from neuralq.systems.backgammon.match import OPPONENTS, MatchResult, play_match
@@ -68,10 +63,11 @@ def _report_match(options: argparse.Namespace, agent: BackgammonAgent) -> None:
     games = 5000 if options.games is None else options.games
     against = options.against or "random"
     opponent = against if against in OPPONENTS else _opponent(against)
-    with _progress(games) as tick:
+    with ProgressBar(games, _tell) as bar:
         match = play_match(
             agent, opponent, games, options.seed,
-            duplicate=options.duplicate, plies=options.plies, workers=options.workers, progress=tick,
+            duplicate=options.duplicate, plies=options.plies, workers=options.workers,
+            progress=lambda played, match: bar((played, match)),
         )  # fmt: skip
     sure = "" if match.standard_error != match.standard_error else f" ± {match.standard_error:.4f} (standard error)"
     lines = [
@@ -109,15 +105,6 @@ def _report_errors(options: argparse.Namespace, found: ErrorRate) -> None:
     print_result(plain, options.json, lines)
 
 
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[int, MatchResult], None]]:
-    console = Console(file=sys.stderr)
-    bar = Progress(
-        BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(compact=True), TextColumn("{task.description}"),
-        console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
-    with bar:
-        task = bar.add_task("games", total=total)
-        yield lambda played, match: bar.update(
-            task, completed=played, description=f"{match.points_per_game:+.3f} points per game"
-        )
+def _tell(report: tuple[int, MatchResult]) -> Told:
+    played, match = report
+    return Told(played, [f"{match.points_per_game:+.3f} points per game"], f"{played:,} games")

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.sweeps import is_td_gammon_run
+from neuralq.apps.cli.sweeps import refuse_other_kinds
 from neuralq.runs.report.comparison import Group, comparison_png, comparison_svg, read_groups
 from neuralq.runs.report.page import format_value
 
@@ -37,8 +37,8 @@ def compare(argv: list[str]) -> int:
     out = None if options.out is None else Path(options.out)
     if out is not None and out.suffix.lower() not in _FORMATS:
         raise Failure(f"--out must end in .svg or .png, got {options.out!r}", 2)
-    for path in filter(is_td_gammon_run, options.runs):
-        raise Failure(f"{path} is a TD-Gammon run, which has no returns; neuralq evaluate {path} --against RUN", 2)
+    for path in options.runs:
+        refuse_other_kinds(path)
     groups, left_out = read_groups(options.runs)
     for reason in left_out:
         print(f"neuralq: left out: {reason}", file=sys.stderr)

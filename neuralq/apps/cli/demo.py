@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.pages.star import write_demo_report
 from neuralq.lab import BairdPrediction, BairdResult, predict_baird, run_baird
 from neuralq.runs import Run, RunConfig, preset_for, train
+from neuralq.runs.control import CONTROL
 from neuralq.runs.folder.run_folder import is_run_folder, read_metrics
-from neuralq.runs.hooks import ProgressBar
 from neuralq.runs.recipe.config import config_from_dict
 
 __all__ = ["baird", "demo", "plain_star", "show_star"]
@@ -65,7 +66,7 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
         shutil.rmtree(path)
     values = {"env": "CartPole-v1", "seed": seed, "stop_at_return": TARGET, **preset_for("CartPole-v1", "rollout")}
     config: RunConfig = config_from_dict(values)
-    with ProgressBar(config.total_steps, TARGET) as bar:
+    with training_bar(CONTROL, config) as bar:
         run = train(config, path, [bar])
     console.print(
         f"   greedy return {run.greedy_return:.1f} over 20 episodes after {run.env_steps:,} steps: "

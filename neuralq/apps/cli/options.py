@@ -8,9 +8,10 @@ import difflib
 import itertools
 import json
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, get_args, get_type_hints
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from types import MappingProxyType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
@@ -28,7 +29,7 @@ from neuralq.runs.recipe.config import (
     fitted_value,
 )
 
-__all__ = ["TrainOptions", "hyphenated", "parse_train", "train_parser"]
+__all__ = ["TrainOptions", "add_fields", "as_typed", "hyphenated", "parse_train", "read_options", "train_parser"]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
@@ -88,8 +89,13 @@ def hyphenated(argv: Sequence[str]) -> list[str]:
     return out
 
 
-def _as_typed(text: str) -> str:
-    """Option names in a text of the parser's, with hyphens."""
+def as_typed(text: str) -> str:
+    """Option names in a text of the parser's, with hyphens.
+
+    Example:
+        >>> as_typed("--lambda_ and --step_size")
+        '--lambda and --step-size'
+    """
     return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text).replace(
         "--print-config", "--print_config"
     )
@@ -115,21 +121,22 @@ def _reader(hint: Any) -> Callable[[str], Any]:
     return read
 
 
-def _refusal(message: str, name: str | None = None) -> Failure:
-    said = " ".join(message.split())
-    if name is not None:
-        said = f"{name} {said}" if said.startswith("must ") else f"{name}: {said}"
-    return Failure(f"{_as_typed(said)}; `neuralq train --help` lists the options", 2)
+def read_options(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
+    """What was given, by name, settings of a learner as a mapping.
 
-
-def _parsed(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
-    """What was given, by name, settings of the learner as a mapping; wrong usage is one line, not all the options."""
+    Raises:
+        Failure: for wrong usage, in one line instead of all the options, with exit status 2.
+    """
+    hint = f"; `{parser.prog} --help` lists the options"
     try:
         found, unknown = parser.parse_known_args(list(argv))
     except argparse.ArgumentError as error:
-        raise _refusal(error.message, error.argument_name) from error
+        said, name = " ".join(error.message.split()), error.argument_name
+        if name is not None:
+            said = f"{name} {said}" if said.startswith("must ") else f"{name}: {said}"
+        raise Failure(as_typed(said) + hint, 2) from error
     if unknown:
-        raise _refusal(f"unrecognized arguments: {' '.join(unknown)}")
+        raise Failure(as_typed(f"unrecognized arguments: {' '.join(unknown)}") + hint, 2)
     given: dict[str, Any] = {}
     for name, value in vars(found).items():
         place, _, field = name.rpartition(".")
@@ -194,7 +201,7 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
     for token in argv:
         other = re.match(r"--(\w+)[.=]", token)
         if other is not None and other[1] in LEARNERS and other[1] != learner:
-            option = _as_typed(token.split("=")[0])
+            option = as_typed(token.split("=")[0])
             raise Failure(
                 f"{option} is for the {other[1]} learner, and this is a {learner} run: "
                 f"add --learner {other[1]} or leave it out",
@@ -208,15 +215,71 @@ def _field_help(settings: type) -> dict[str, str]:
     return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
 
 
-def _add_fields(parser: Any, settings: type[Any], prefix: str, preset: dict[str, Any]) -> None:
+def add_fields(
+    parser: Any,
+    settings: type[Any],
+    prefix: str = "",
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+    short: Mapping[str, str] = MappingProxyType({}),
+    leave_out: Collection[str] = (),
+) -> None:
+    """An option for each field of a dataclass, with its type, its default and what its docstring says of it.
+
+    Args:
+        parser: takes the options.
+        settings: the dataclass.
+        prefix: before the name of each option.
+        defaults: those that are not the dataclass's own.
+        short: options that are named otherwise than their fields, by field.
+        leave_out: fields that have no option.
+
+    Example:
+        >>> parser = argparse.ArgumentParser()
+        >>> add_fields(parser, TrainOptions, leave_out=("notes",))
+        >>> parser.parse_args(["--seeds", "3"]).seeds
+        3
+    """
     texts, types = _field_help(settings), get_type_hints(settings)
     for f in fields(settings):
-        if prefix or f.name not in _OWN_PARSING:
-            default = preset.get(f.name, f.default)
-            words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
-            kind = next((k for k in (types[f.name], *get_args(types[f.name])) if k in words), str)
-            text = f"{texts[f.name].rstrip('.')} (default: {'none' if default is None else default})".replace("%", "%%")
-            parser.add_argument(f"--{prefix}{f.name}", type=_reader(types[f.name]), metavar=words[kind], help=text)
+        if f.name in leave_out:
+            continue
+        default, hint = defaults.get(f.name, f.default), types[f.name]
+        more: dict[str, Any] = {"type": _reader(hint)}
+        if get_origin(hint) is tuple:
+            more, default = {"type": _reader(get_args(hint)[0]), "nargs": "+"}, " ".join(map(str, default))
+        words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
+        kind = next((k for k in (hint, *get_args(hint)) if k in words), str)
+        shown = "" if default is MISSING else f" (default: {'none' if default is None else default})"
+        text = f"{texts[f.name].rstrip('.')}{shown}".replace("%", "%%")
+        option = f"--{prefix}{short.get(f.name, f.name)}"
+        parser.add_argument(option, dest=prefix + f.name, metavar=words[kind], help=text, **more)
+
+
+_MORE: tuple[tuple[str, Any, str, str], ...] = (
+    ("env_kwargs", dict, "MAPPING", "JSON or YAML mapping passed to gymnasium.make"),
+    (
+        "body",
+        dict | str | None,
+        "NAME",
+        f"network body: {', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: "
+        "'{class: MLP, hidden: [64]}'",
+    ),
+    ("hidden", str, "N,N", "widths of the hidden layers, e.g. 64,64"),
+    ("layer_norm", bool | None, "{true,false}", "layer normalisation in the network"),
+    ("activation", str, "NAME", "relu, tanh or leaky_relu"),
+    ("config", str, "FILE", "YAML file of options, as --print_config writes it"),
+    ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
+    ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
+    ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),
+    ("workers", int, "N", "how many seeds at a time (default: as many as there are cores)"),
+    ("hook", str, "module:name", "function or class of your own that takes every row of metrics"),
+)
+_FLAGS = {
+    "print_config": "print the resulting configuration and exit",
+    "tensorboard": "write TensorBoard event files (extra tensorboard)",
+    "wandb": "log to Weights & Biases (extra wandb)",
+    "json": "print the result as one JSON object on the last line",
+}
 
 
 def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParser:
@@ -231,40 +294,20 @@ def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParse
         exit_on_error=False,
         argument_default=argparse.SUPPRESS,
     )
-    add = parser.add_argument
-    add("--env", type=str, help=argparse.SUPPRESS)
-    add("--env_kwargs", type=_reader(dict), metavar="MAPPING", help="JSON or YAML mapping passed to gymnasium.make")
-    add("--learner", choices=tuple(LEARNERS), help=f"how to learn (default: {RunConfig.learner})")
-    add("--layout", choices=LAYOUTS, help=f"how values are represented (default: {RunConfig.layout})")
-    _add_fields(parser, RunConfig, "", preset)
-    bodies = f"{', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: '{{class: MLP, hidden: [64]}}'"
-    add("--body", type=_reader(dict | str | None), metavar="NAME", help=f"network body: {bodies}")
-    add("--hidden", type=str, metavar="N,N", help="widths of the hidden layers, e.g. 64,64")
-    add("--layer_norm", type=_reader(bool | None), metavar="{true,false}", help="layer normalisation in the network")
-    add("--activation", type=str, metavar="NAME", help="relu, tanh or leaky_relu")
-    add("--config", type=str, metavar="FILE", help="YAML file of options, as --print_config writes it")
-    add("--print_config", action="store_true", help="print the resulting configuration and exit")
-    add("--run_dir", type=str, metavar="FOLDER", help="where the run goes (default: a folder under runs/)")
-    add(
-        "--preset",
-        type=_reader(bool),
-        metavar="{true,false}",
-        help="whether to start from the environment's preset (default: true)",
-    )
-    add("--seeds", type=_reader(int), metavar="N", help="run N seeds, counted from --seed, in processes side by side")
-    add(
-        "--workers",
-        type=_reader(int),
-        metavar="N",
-        help="how many seeds at a time (default: as many as there are cores)",
-    )
-    add("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
-    add("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
-    add("--hook", type=str, metavar="module:name", help="function or class of your own that takes every row of metrics")
-    add("--json", action="store_true", help="print the result as one JSON object on the last line")
+    parser.add_argument("--env", type=str, help=argparse.SUPPRESS)
+    for name, choices, default, text in (
+        ("learner", tuple(LEARNERS), RunConfig.learner, "how to learn"),
+        ("layout", LAYOUTS, RunConfig.layout, "how values are represented"),
+    ):
+        parser.add_argument(f"--{name}", choices=choices, help=f"{text} (default: {default})")
+    add_fields(parser, RunConfig, defaults=preset, leave_out=_OWN_PARSING)
+    for name, hint, metavar, text in _MORE:
+        parser.add_argument(f"--{name}", type=_reader(hint), metavar=metavar, help=text)
+    for name, text in _FLAGS.items():
+        parser.add_argument(f"--{name}", action="store_true", help=text)
     kind = LEARNERS[learner]
     group = parser.add_argument_group(f"options of the {learner} learner", f"{kind.title}: {kind.source}")
-    _add_fields(group, kind.settings, f"{learner}.", preset.get(learner, {}))
+    add_fields(group, kind.settings, f"{learner}.", preset.get(learner, {}))
     return parser
 
 
@@ -281,12 +324,12 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         preset = {name: value for name, value in preset.items() if name != "body"}
     has_preset = bool(preset)
     if {"-h", "--help"} & set(rest):
-        print(_as_typed(train_parser(known.learner, preset).format_help()))
+        print(as_typed(train_parser(known.learner, preset).format_help()))
         return None
     _refuse_other_learners(rest, known.learner)
     # A run has one learner, so that λ needs no place.
     rest = [re.sub(r"^--lambda_(?==|$)", f"--{known.learner}.lambda_", token) for token in rest]
-    given = _parsed(train_parser(known.learner, preset), rest)
+    given = read_options(train_parser(known.learner, preset), rest)
     preset, notes = cut_to_budget(preset, {**file, **given, "learner": known.learner})
     options = TrainOptions(
         run_dir=given.pop("run_dir", None),

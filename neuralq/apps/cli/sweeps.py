@@ -8,17 +8,16 @@ import time
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
 from neuralq.apps.cli import Failure, main, print_result
+from neuralq.apps.cli.kinds import say
 from neuralq.apps.cli.options import TrainOptions
+from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
-from neuralq.runs.folder.run_folder import default_run_path, is_run_folder, read_config
+from neuralq.runs.folder.run_folder import default_run_path, is_run_folder
 from neuralq.runs.hooks import own_hook
+from neuralq.runs.kinds import kind_in, kind_named
 from neuralq.runs.recipe.config import config_to_dict
 from neuralq.runs.sweep import (
     Status,
@@ -33,9 +32,16 @@ from neuralq.runs.sweep import (
 )
 from neuralq.runs.sweep.statistics import interquartile_mean
 
-__all__ = ["SweepBar", "child", "is_td_gammon_run", "resume_seeds", "single_run", "started_from", "train_seeds"]
+__all__ = [
+    "child",
+    "refuse_other_kinds",
+    "resume_seeds",
+    "single_run",
+    "started_from",
+    "sweep_bar",
+    "train_seeds",
+]
 
-_QUIET_SECONDS = 10.0
 _CHILD = "from neuralq.apps.cli.sweeps import child; child()"
 
 
@@ -70,23 +76,24 @@ def single_run(path: str) -> Path:
     """The folder of one run on an environment.
 
     Raises:
-        Failure: if a sweep is there, whose seeds are runs, or a run of TD-Gammon.
+        Failure: if a sweep is there, whose seeds are runs, or a run of another kind.
     """
     if is_sweep_folder(path):
         seed = open_sweep(path).seeds[0]
         raise Failure(f"{path} is a sweep of several runs; name one of them, e.g. {Path(path) / f'seed-{seed}'}", 2)
-    if is_td_gammon_run(path):
-        raise Failure(
-            f"{path} is a TD-Gammon run, which is measured by `neuralq evaluate {path} --against pubeval` and played "
-            f"by `neuralq play backgammon --agent {path}`",
-            2,
-        )
+    refuse_other_kinds(path)
     return Path(path)
 
 
-def is_td_gammon_run(path: str | Path) -> bool:
-    """Whether a run is there that has learned backgammon, and knows no environment."""
-    return is_run_folder(path) and read_config(path).get("kind") == "td-gammon"
+def refuse_other_kinds(path: str | Path) -> None:
+    """Nothing where there is a run on an environment, or none.
+
+    Raises:
+        Failure: if there is a run of another kind, with what to do instead.
+    """
+    name = kind_in(path)
+    if name is not None and (command := kind_named(name).command) is not None:
+        raise Failure(f"{path} is {kind_named(name).title}, which is {command.instead.format(run=path)}", 2)
 
 
 def child() -> None:
@@ -108,14 +115,14 @@ def _command(sweep: Sweep, seed: int) -> list[str]:
 
 def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:
     workers = min(num_workers or num_cores(), len(sweep.seeds))
-    print(f"neuralq: sweep folder {sweep.path}{origin}; {len(sweep.seeds)} seeds, {workers} at a time", file=sys.stderr)
-    with SweepBar(len(sweep.seeds)) as bar:
+    say(f"sweep folder {sweep.path}{origin}; {len(sweep.seeds)} seeds, {workers} at a time")
+    with sweep_bar(sweep) as bar:
         result = run_sweep(sweep, _command, num_workers, bar)
     target = sweep.config.get("stop_at_return")
     plain = {**result.plain(), "sweep_dir": str(sweep.path)}
     print_result(plain, as_json, _lines(sweep, result))
     if result.interrupted_by is not None:
-        print(f"neuralq: {result.interrupted_by}: go on with: neuralq resume {sweep.path}", file=sys.stderr)
+        say(f"{result.interrupted_by}: go on with: neuralq resume {sweep.path}")
         return 128 + signal.Signals[result.interrupted_by].value
     failed = [run.seed for run in result.runs if run.state == "failed"]
     if failed:
@@ -146,63 +153,33 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
     return [*lines, f"sweep folder {sweep.path}"]
 
 
-class SweepBar:
-    """Progress over all seeds: steps, rate, time left, and the interquartile mean of those that have finished.
-
-    Args:
-        num_seeds: how many there are.
-        stream: where to draw; standard error by default.
-        clock: tells the time in seconds.
+def sweep_bar(
+    sweep: Sweep, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+) -> ProgressBar[Status]:
+    """Progress over all seeds: steps, rate, and the interquartile mean of those that have finished.
 
     Example:
         >>> import io
         >>> out = io.StringIO()
-        >>> with SweepBar(2, out) as bar:
+        >>> with sweep_bar(Sweep(Path(), {"total_steps": 100}, (0, 1)), out) as bar:
         ...     bar(Status(50, 200, (1,), 1, (), (31.0,)))
         >>> out.getvalue().strip()
         '1 of 2 seeds · 50 of 200 steps · IQM 31.0'
     """
+    began: list[tuple[float, int]] = []
 
-    def __init__(
-        self, num_seeds: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._console = Console(file=stream or sys.stderr)
-        self._num_seeds, self._clock = num_seeds, clock
-        self._said: tuple[float, int] = (clock(), 0)
-        self._began: tuple[float, int] | None = None
-        self._bar = Progress(
-            BarColumn(bar_width=24),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(compact=True),
-            console=self._console,
-            refresh_per_second=4,
-            disable=not self._console.is_terminal,
-        )
-        self._task = self._bar.add_task("seeds", total=None, text="")
-
-    def __enter__(self) -> SweepBar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
-
-    def __call__(self, status: Status) -> None:
-        """Take in how far the sweep has come."""
-        now = self._clock()
-        self._began = self._began or (now, status.env_steps)
-        parts = [f"{status.num_finished} of {self._num_seeds} seeds"]
+    def tell(status: Status) -> Told:
+        now = clock()
+        began[1:] = [(now, status.env_steps)]  # the first stays
+        seconds, steps = now - began[0][0], status.env_steps - began[0][1]
+        parts = [f"{status.num_finished} of {len(sweep.seeds)} seeds"]
         if status.failed:
             parts.append(f"failed: {', '.join(map(str, status.failed))}")
         parts.append(f"{status.env_steps:,} of {status.total_steps:,} steps")
-        if now > self._began[0]:
-            parts.append(f"{(status.env_steps - self._began[1]) / (now - self._began[0]):,.0f} steps/s")
+        if seconds > 0:
+            parts.append(f"{steps / seconds:,.0f} steps/s")
         if status.returns:
             parts.append(f"IQM {float(interquartile_mean(status.returns)):.1f}")
-        text = " · ".join(parts)
-        self._bar.update(self._task, completed=status.env_steps, total=status.total_steps, text=text)
-        ended = status.num_finished + len(status.failed)
-        if not self._console.is_terminal and (now - self._said[0] > _QUIET_SECONDS or ended != self._said[1]):
-            self._said = (now, ended)
-            self._console.print(text, highlight=False, soft_wrap=True)
+        return Told(status.env_steps, parts, event=status.num_finished + len(status.failed))
+
+    return ProgressBar(sweep.total_steps * len(sweep.seeds), tell, stream, clock)

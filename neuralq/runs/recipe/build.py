@@ -275,6 +275,7 @@ def _warm_buffer(buffer: ReplayBuffer, stream: Interaction, settings: Any) -> No
 def plan_of(config: RunConfig) -> Plan:
     """When this run evaluates, saves and stops."""
     return Plan(
+        unit="env_steps",
         budget=config.total_steps,
         evaluate_every=config.evaluate_every,
         checkpoint_every=config.checkpoint_every,

@@ -21,7 +21,7 @@ import numpy as np
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import Best
 from neuralq.runs.folder.run_folder import RunFolder, RunFolderError, default_run_path, read_config
-from neuralq.runs.kinds import Kind, kind_in
+from neuralq.runs.kinds import CommandLine, Kind, kind_in
 from neuralq.runs.loop import Diverged, Hook, Plan, Progress
 from neuralq.runs.stop_request import StopRequest
 from neuralq.systems.backgammon.agent import BackgammonAgent
@@ -94,7 +94,6 @@ class GammonTrainee:
         MissingExtra: if pubeval or gnubg shall be played and gnubg-nn is not installed.
     """
 
-    unit = "games"
     observed = None
 
     def __init__(self, config: TdGammonConfig) -> None:
@@ -175,7 +174,7 @@ class GammonTrainee:
 
 def _plan(config: TdGammonConfig) -> Plan:
     periods = config.evaluate_every, config.checkpoint_every, config.log_every
-    return Plan(config.budget, *periods, config.seed, log_whole_periods=True)
+    return Plan("games", config.budget, *periods, config.seed, log_whole_periods=True)
 
 
 def _default_path(config: TdGammonConfig) -> Path:
@@ -226,6 +225,14 @@ def load_agent(path: str | Path | None = None) -> BackgammonAgent:
     return BackgammonAgent(learner.network)
 
 
+def _notes(config: TdGammonConfig, latest: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{name} {latest[f'ppg_{name}']:+.3f} ± {latest[f'ppg_{name}_standard_error']:.3f}"
+        for name in config.evaluate_against
+        if f"ppg_{name}" in latest
+    ]
+
+
 def _load(run_dir: Path, best: bool) -> BackgammonAgent:
     if best:
         raise ValueError(f"a TD-Gammon run keeps its newest weights only, and {run_dir} is one; leave best out")
@@ -234,7 +241,7 @@ def _load(run_dir: Path, best: bool) -> BackgammonAgent:
 
 TD_GAMMON = Kind(
     name=KIND,
-    title="TD-Gammon",
+    title="a TD-Gammon run",
     config=TdGammonConfig,
     budget="num_games",
     to_plain=config_to_dict,
@@ -245,6 +252,28 @@ TD_GAMMON = Kind(
     plan=_plan,
     result=_result,
     load=_load,
+    notes=_notes,
+    command=CommandLine(
+        "Learn backgammon from games against oneself by TD(λ): Tesauro's 198 inputs, one hidden layer.",
+        (
+            "neuralq train td-gammon --games 100000 --seed 3",
+            "neuralq train td-gammon --hidden 40 --outputs 1 --lambda 0.7 --lambda-end 0",
+            "neuralq train td-gammon --mode batched --threads 2 --batch-games 8",
+            "neuralq train td-gammon --against random pubeval --evaluate-every 50000 --evaluation-games 5000",
+            "neuralq train td-gammon --config runs/demo/config.json --seed 4",
+        ),
+        {
+            "num_games": "games",
+            "num_hidden": "hidden",
+            "num_outputs": "outputs",
+            "num_threads": "threads",
+            "evaluate_against": "against",
+        },
+        measure="neuralq.apps.cli.backgammon_match:evaluate_backgammon",
+        measures=("--against", "--error-rate", ".safetensors"),
+        instead="measured by `neuralq evaluate {run} --against pubeval` and played by `neuralq play backgammon "
+        "--agent {run}`",
+    ),
 )
 
 

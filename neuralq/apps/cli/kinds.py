@@ -1,0 +1,163 @@
+"""``neuralq train NAME`` and ``neuralq resume`` for kinds of runs that have options of their own."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from neuralq.apps.cli import Failure, print_result
+from neuralq.apps.cli.options import add_fields, as_typed, hyphenated, read_options
+from neuralq.apps.cli.progress import training_bar
+from neuralq.runs.folder.run_folder import read_config, refuse_old_run
+from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named
+
+__all__ = ["conclude", "measured_by", "new_budget", "resume_kind", "say", "train_kind"]
+
+
+def say(line: str) -> None:
+    """A line beside the result, for whoever watches."""
+    print(f"neuralq: {line}", file=sys.stderr, flush=True)
+
+
+def conclude(run: Result, as_json: bool, plain: dict[str, Any], lines: Sequence[str]) -> int:
+    """Prints the result of a run; the exit status says whether a signal ended it."""
+    if run.interrupted_by is not None:
+        say(f"{run.interrupted_by}: saved at {run.trained}; go on with: neuralq resume {run.run_dir}")
+    print_result(plain, as_json, lines)
+    return 0 if run.interrupted_by is None else 128 + signal.Signals[run.interrupted_by].value
+
+
+def train_kind(name: str, argv: Sequence[str]) -> int:
+    """Train as the options of this kind of run say."""
+    kind = kind_named(name)
+    parser = _parser(kind)
+    if {"-h", "--help"} & set(argv):
+        print(as_typed(parser.format_help()))
+        return 0
+    given = read_options(parser, hyphenated(argv))
+    as_json, run_dir = given.pop("json", False), given.pop("run_dir", None)
+    config = _config(kind, given)
+    path = Path(run_dir or kind.default_path(config))
+    refuse_old_run(path)  # also by the run, but preparing takes seconds
+    say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
+    with training_bar(kind, config) as bar:
+        run = kind.train(config, path, [bar])
+    return conclude(run, as_json, run.plain(), [*run.lines(), f"run folder {run.run_dir}"])
+
+
+def resume_kind(name: str, options: argparse.Namespace) -> int:
+    """Go on with a run, as the options of ``neuralq resume`` say."""
+    kind = kind_named(name)
+    for other in ("workers", "hook"):
+        if getattr(options, other) is not None:
+            raise Failure(f"--{other} is not for {kind.title} like {options.run}; leave it out", 2)
+    budget, config = new_budget(kind, options), kind.from_plain(read_config(options.run))
+    try:
+        config = config if budget is None else kind.with_budget(config, budget)
+    except ValueError as error:
+        raise Failure(_in_options(kind, str(error)), 2) from error
+    with training_bar(kind, config) as bar:
+        run = kind.resume(options.run, budget, [bar])
+    return conclude(run, options.json, run.plain(), [*run.lines(), f"run folder {run.run_dir}"])
+
+
+def new_budget(kind: Kind[Any, Any, Any], options: argparse.Namespace) -> int | None:
+    """The new budget that ``neuralq resume`` was given.
+
+    Raises:
+        Failure: if it is in what this kind of run is not counted in.
+    """
+    given = {"total_steps": options.total_steps, "num_games": options.games}
+    for field, option in (("total_steps", "--total-steps"), ("num_games", "--games")):
+        if field != kind.budget and given[field] is not None:
+            raise Failure(f"{option} is not for {kind.title} like {options.run}; leave it out", 2)
+    budget: int | None = given[kind.budget]
+    return budget
+
+
+def measured_by(words: Sequence[str]) -> str | None:
+    """The command that evaluates what the words of a command line name or ask, if a kind of run has its own."""
+    named = next(filter(None, map(kind_in, words)), None)
+    for name in KINDS if named is None else [named]:
+        command = kind_named(name).command
+        if command is not None and (
+            named or any(w.startswith(m) or w.endswith(m) for w in words for m in command.measures)
+        ):
+            return command.measure
+    return None
+
+
+def _parser(kind: Kind[Any, Any, Any]) -> argparse.ArgumentParser:
+    command = _command(kind)
+    parser = argparse.ArgumentParser(
+        prog=f"neuralq train {kind.name}",
+        usage=f"neuralq train {kind.name} [options]",
+        description=command.description,
+        epilog="\n  ".join(["examples:", *command.examples]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        exit_on_error=False,
+        argument_default=argparse.SUPPRESS,
+    )
+    parts = _parts(kind)
+    inner = {f.name for settings in parts.values() for f in fields(settings)}
+    for settings in parts.values():
+        add_fields(parser, settings, short=command.short)
+    add_fields(parser, kind.config, short=command.short, leave_out={*parts, *inner})
+    parser.add_argument("--config", metavar="FILE", help="config.json of a run, to start from its settings")
+    parser.add_argument("--run_dir", metavar="FOLDER", help="where the run goes (default: a folder under runs/)")
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    return parser
+
+
+def _command(kind: Kind[Any, Any, Any]) -> CommandLine:
+    assert kind.command is not None, f"neuralq train has options of its own for {kind.name}"
+    return kind.command
+
+
+def _parts(kind: Kind[Any, Any, Any]) -> dict[str, type[Any]]:
+    """Fields of the configuration that are dataclasses themselves."""
+    hints = get_type_hints(kind.config).items()
+    return {name: hint for name, hint in hints if isinstance(hint, type) and is_dataclass(hint)}
+
+
+def _config(kind: Kind[Any, Any, Any], given: dict[str, Any]) -> Any:
+    """Defaults, then the file, then the command line, the later winning; "none" alone is an empty list."""
+    file = given.pop("config", None)
+    given = {name: [] if value == ["none"] else value for name, value in given.items()}
+    try:
+        plain: dict[str, Any] = (
+            {"kind": kind.name} if file is None else kind.to_plain(kind.from_plain(_read_file(file)))
+        )
+        for place, settings in _parts(kind).items():
+            own = {f.name: given.pop(f.name) for f in fields(settings) if f.name in given}
+            # What both have, a budget, is the inner one's to say: the outer one would win.
+            plain = {name: value for name, value in plain.items() if name not in own}
+            plain[place] = {**plain.get(place, {}), **own}
+        return kind.from_plain({**plain, **given})
+    except ValueError as error:
+        raise Failure(_in_options(kind, str(error)), 2) from error
+
+
+def _read_file(path: str) -> dict[str, Any]:
+    try:
+        content = json.loads(Path(path).read_bytes())
+    except (OSError, ValueError) as error:
+        raise Failure(f"cannot read --config {path}: {error}", 2) from error
+    if not isinstance(content, dict):
+        raise Failure(f"--config {path} must hold an object, got {type(content).__name__}", 2)
+    return content
+
+
+def _in_options(kind: Kind[Any, Any, Any], message: str) -> str:
+    """Names of fields as the options that set them; those of one word are left, which may be words of the message."""
+    short = _command(kind).short
+    names = {f.name for settings in (kind.config, *_parts(kind).values()) for f in fields(settings) if "_" in f.name}
+    return re.sub(r"\b\w+", lambda m: as_typed(f"--{short.get(m[0], m[0])}") if m[0] in names else m[0], message)

@@ -1,0 +1,138 @@
+"""One progress bar for whatever takes long: how far it is, for how long yet, and what else is worth saying."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Generic, NamedTuple, TextIO, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from neuralq.runs.kinds import Kind
+
+__all__ = ["ProgressBar", "Told", "told_of_rows", "training_bar"]
+
+_QUIET_SECONDS = 10.0
+"""Where the output is no terminal: one line at most this often."""
+
+T = TypeVar("T")
+
+
+class Told(NamedTuple):
+    """What is said of one report.
+
+    Args:
+        so_far: how much there is.
+        parts: what stands beside the bar.
+        amount: how much in words, which stands before the parts where there is no bar.
+        event: where it changes from 0, or from what it was, a line is due at once.
+    """
+
+    so_far: int
+    parts: Sequence[str]
+    amount: str = ""
+    event: int = 0
+
+
+class ProgressBar(Generic[T]):
+    """Called with reports of what goes on, it draws a bar; plain lines where the output is no terminal.
+
+    Args:
+        total: of how much.
+        tell: what to say of a report.
+        stream: where to draw; standard error by default, so that standard output stays clean.
+        clock: tells the time in seconds.
+
+    Example:
+        >>> import io
+        >>> out = io.StringIO()
+        >>> with ProgressBar(100, lambda so_far: Told(so_far, ["so far"], event=so_far), out) as bar:
+        ...     bar(50)
+        >>> out.getvalue().strip()
+        'so far'
+    """
+
+    def __init__(
+        self,
+        total: int,
+        tell: Callable[[T], Told],
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._tell, self._clock = tell, clock
+        self._console = Console(file=stream or sys.stderr)
+        self._said = (clock(), 0)
+        self._bar = Progress(
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[text]}"),
+            console=self._console,
+            refresh_per_second=4,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=total, text="")
+
+    def __enter__(self) -> ProgressBar[T]:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def __call__(self, report: T, /) -> None:
+        """Take in a report."""
+        told, now = self._tell(report), self._clock()
+        self._bar.update(self._task, completed=told.so_far, text=" · ".join(told.parts))
+        if not self._console.is_terminal and (now - self._said[0] > _QUIET_SECONDS or told.event != self._said[1]):
+            self._said = (now, told.event)
+            line = " · ".join(filter(None, (told.amount, *told.parts)))
+            self._console.print(line, highlight=False, soft_wrap=True)
+
+
+def told_of_rows(
+    unit: str, total: int, notes: Callable[[Mapping[str, Any]], Sequence[str]]
+) -> Callable[[Mapping[str, Any]], Told]:
+    """What is said of rows of metrics: amount and rate, time left, and ``notes`` of the latest value of each column.
+
+    Example:
+        >>> tell = told_of_rows("games", 100, lambda latest: [f"win rate {latest['win_rate']}"])
+        >>> tell({"games": 50, "games_per_second": 5.0, "win_rate": 0.5}).amount
+        '50 of 100 games · 10 s left'
+    """
+    latest: dict[str, Any] = {}
+    things = unit.removeprefix("env_")
+
+    def tell(row: Mapping[str, Any]) -> Told:
+        latest.update({name: value for name, value in row.items() if value is not None})
+        so_far, rate = row[unit], latest.get(f"{things}_per_second", 0.0)
+        amount = f"{so_far:,} of {total:,} {things}"
+        if rate > 0:
+            seconds = max(total - so_far, 0) / rate
+            amount += f" · {seconds / 60:.0f} min left" if seconds >= 90 else f" · {seconds:.0f} s left"
+        return Told(so_far, [f"{rate:,.0f} {things}/s", *notes(latest)], amount)
+
+    return tell
+
+
+def training_bar(
+    kind: Kind[Any, Any, Any],
+    config: Any,
+    stream: TextIO | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> ProgressBar[Mapping[str, Any]]:
+    """The bar of a run, which is a hook.
+
+    Example:
+        >>> import io
+        >>> from neuralq.runs import RunConfig
+        >>> from neuralq.runs.control import CONTROL
+        >>> with training_bar(CONTROL, RunConfig(), io.StringIO()) as bar:
+        ...     bar({"kind": "train", "env_steps": 50, "steps_per_second": 10.0, "episode_return": None})
+    """
+    plan = kind.plan(config)
+    tell = told_of_rows(plan.unit, plan.budget, lambda latest: kind.notes(config, latest))
+    return ProgressBar(plan.budget, tell, stream, clock)
