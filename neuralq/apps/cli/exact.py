@@ -6,7 +6,7 @@ import argparse
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,10 @@ def solve(argv: list[str]) -> int:
     options = _parser().parse_args(argv)
     mdp, layout = _model(options.env, options.env_kwargs)
     solution = solve_mdp(mdp, options.gamma, options.method, options.tol, max_iterations=options.max_iterations)
-    grid = None if layout is None else layout.drawn(mdp, solution)
+    grid, lines = None, _table(mdp, solution)
+    if layout is not None:
+        grid = layout.drawn(mdp, solution)
+        lines = [*drawing_lines(grid), _legend(layout)]
     if options.svg is not None:
         if grid is None:
             raise Failure(f"{options.env} names no rows and columns, so there is no grid to draw; leave out --svg")
@@ -57,7 +60,6 @@ def solve(argv: list[str]) -> int:
         "converged": solution.converged,
         "seconds": solution.seconds,
     }
-    lines = _table(mdp, solution) if grid is None else [*drawing_lines(grid), _legend(layout)]
     print_result(plain, options.json, [*lines, *_summary(solution)])
     if not solution.converged:
         raise Failure(f"did not converge: the error may be as large as {solution.bound:.3g}; allow a larger --tol")
@@ -113,19 +115,12 @@ def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | No
         env.close()
 
 
-class _Layout:
-    """Where the states of a grid lie.
+class _Layout(NamedTuple):
+    """Where the states of a grid lie: its width, where each action goes (0 north to 3 west), what stands in each cell."""
 
-    Args:
-        num_columns: width.
-        directions: where each action goes: 0 north, 1 east, 2 south, 3 west; None for a move that has no arrow here.
-        signs: what stands in each cell, or a blank.
-    """
-
-    def __init__(self, num_columns: int, directions: tuple[int | None, ...], signs: str) -> None:
-        self.num_columns = num_columns
-        self.directions = directions
-        self.signs = signs
+    num_columns: int
+    directions: tuple[int, ...]
+    signs: str
 
     def drawn(self, mdp: FiniteMDP, solution: Solution) -> GridDrawing:
         """V* with an arrow for every optimal move; walls are cells that nothing leads to and nothing leaves."""
@@ -137,8 +132,8 @@ class _Layout:
             elif mdp.is_terminal[s]:
                 cells.append(Square("end") if entered[s] else Square(wall=True))
             else:
-                best = (self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
-                arrows = tuple(Arrow(d) for d in sorted(d for d in best if d is not None))
+                best = sorted(self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
+                arrows = tuple(map(Arrow, best))
                 cells.append(Square(short(float(solution.v[s])), arrows))
         return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
 
@@ -163,10 +158,9 @@ def _named_layout(mdp: FiniteMDP) -> _Layout | None:
     num_columns = 1 + max((column for _, column in places), default=-1)
     in_order = [(s // num_columns, s % num_columns) for s in range(mdp.num_states)] if num_columns else []
     names = mdp.action_names or ()
-    if not in_order or places != in_order or num_columns > _MOST_COLUMNS or not set(_COMPASS) <= set(names):
+    if not in_order or places != in_order or num_columns > _MOST_COLUMNS or set(names) != set(_COMPASS):
         return None
-    directions = tuple(_COMPASS.index(name) if name in _COMPASS else None for name in names)
-    return None if None in directions else _Layout(num_columns, directions, " " * mdp.num_states)
+    return _Layout(num_columns, tuple(map(_COMPASS.index, names)), " " * mdp.num_states)
 
 
 def _entered(mdp: FiniteMDP) -> NDArray[np.bool_]:
@@ -176,10 +170,8 @@ def _entered(mdp: FiniteMDP) -> NDArray[np.bool_]:
     return entered
 
 
-def _legend(layout: _Layout | None) -> str:
-    assert layout is not None
-    moves = (f"{ARROWS[d]} is action {a}" for a, d in enumerate(layout.directions) if d is not None)
-    return ", ".join(moves)
+def _legend(layout: _Layout) -> str:
+    return ", ".join(f"{ARROWS[d]} is action {a}" for a, d in enumerate(layout.directions))
 
 
 def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -139,22 +139,6 @@ def _even(length: int) -> int:
     return length + length % 2
 
 
-class _Writer(Protocol):
-    """Takes pictures of one size and writes a film when closed."""
-
-    def add(self, image: Image) -> None:
-        """One picture more."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left; the file is there."""
-        ...
-
-    def discard(self) -> None:
-        """Leave no file."""
-        ...
-
-
 class GifWriter:
     """Writes an endless GIF; where pictures come faster than 25 a second, some are left out and the pace is kept.
 
@@ -235,20 +219,16 @@ class Mp4Writer:
         self._partial.unlink(missing_ok=True)
 
 
-def writers_for(gif: str | None, mp4: str | None, rate: float) -> list[_Writer]:
+def writers_for(gif: str | None, mp4: str | None, rate: float) -> list[GifWriter | Mp4Writer]:
     """One writer for each file asked for.
 
     Raises:
         Failure: if none is, or the folder does not exist.
     """
-    if gif is None and mp4 is None:
+    asked = [(kind, Path(name)) for kind, name in ((GifWriter, gif), (Mp4Writer, mp4)) if name is not None]
+    if not asked:
         raise Failure("name a file: --gif FILE, --mp4 FILE or both", 2)
-    for name in (gif, mp4):
-        if name is not None and not Path(name).absolute().parent.is_dir():
-            raise Failure(f"there is no folder {Path(name).parent}; make it first")
-    made: list[_Writer] = []
-    if gif is not None:
-        made.append(GifWriter(Path(gif), rate))
-    if mp4 is not None:
-        made.append(Mp4Writer(Path(mp4), rate))
-    return made
+    for _, path in asked:
+        if not path.absolute().parent.is_dir():
+            raise Failure(f"there is no folder {path.parent}; make it first")
+    return [kind(path, rate) for kind, path in asked]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from neuralq.apps.cli import command_parser
@@ -27,22 +26,20 @@ def play(argv: list[str]) -> int:
     from neuralq.apps.web.server import need, play_app, serve_app
 
     need("starlette", "uvicorn", what="the page to play on")
-    offer = _tictactoe() if options.game == "tictactoe" else _backgammon(options.agent, options.plies)
-    announce: Callable[[str], None] | None = None
-    if options.json:
+    if options.game == "backgammon":
+        title, offer = "Backgammon", _backgammon(options.agent, options.plies)
+    else:
+        from neuralq.apps.web.play_tictactoe import tictactoe
 
-        def announce(url: str) -> None:
-            print(json.dumps({"game": options.game, "url": url}), flush=True)
+        title, offer = "Tic-tac-toe", tictactoe()
 
-    title = {"backgammon": "Backgammon", "tictactoe": "Tic-tac-toe"}[options.game]
+    def announce(url: str) -> None:
+        print(json.dumps({"game": options.game, "url": url}), flush=True)
+
     serve_app(
-        lambda: play_app(offer, options.host),
-        options.host,
-        options.port,
-        title,
-        open_browser=not options.no_browser,
-        announce=announce,
-    )
+        lambda: play_app(offer, options.host), options.host, options.port, title,
+        open_browser=not options.no_browser, announce=announce if options.json else None,
+    )  # fmt: skip
     return 0
 
 
@@ -64,12 +61,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=0, help="port to serve on (default: 0, a free one)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the page in the browser")
     return parser
-
-
-def _tictactoe() -> Offer:
-    from neuralq.apps.web.play_tictactoe import tictactoe
-
-    return tictactoe()
 
 
 def _backgammon(path: str | None, plies: int) -> Offer:

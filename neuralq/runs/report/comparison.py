@@ -22,7 +22,7 @@ from neuralq.types import Floats
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Curve", "Group", "comparison_png", "comparison_svg", "group_curve", "read_groups"]
+__all__ = ["Group", "GroupCurve", "comparison_png", "comparison_svg", "group_curve", "read_groups"]
 
 _MOST_POINTS = 120
 _CURVE_RESAMPLES = 1_000
@@ -86,7 +86,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Curve:
+class GroupCurve:
     """Interquartile mean over a group's runs at each of ``steps`` ``[P]``; the band is None for a single run."""
 
     steps: Floats
@@ -178,7 +178,7 @@ def _label(own: Mapping[str, Any]) -> str:
     return ", ".join(f"{name.rsplit('.', 1)[-1].rstrip('_')} {value}" for name, value in own.items())
 
 
-def group_curve(group: Group) -> Curve:
+def group_curve(group: Group) -> GroupCurve:
     """Greedy return over environment steps: the interquartile mean of the runs and its pointwise 95 % interval.
 
     Runs are evaluated at steps of their own, so each is interpolated between its evaluations. A run that ended early
@@ -192,9 +192,9 @@ def group_curve(group: Group) -> Curve:
     values = np.stack([np.interp(every, run.steps, run.returns) for run in group.runs], axis=-1)  # [P, runs]
     iqm = interquartile_mean(values)
     if len(group.runs) < 2:
-        return Curve(every, iqm, None, None)
+        return GroupCurve(every, iqm, None, None)
     low, high = bootstrap_interval(values[:, :, None], np.random.default_rng(0), num_resamples=_CURVE_RESAMPLES)
-    return Curve(every, iqm, low, high)
+    return GroupCurve(every, iqm, low, high)
 
 
 def comparison_svg(groups: Sequence[Group]) -> str:
