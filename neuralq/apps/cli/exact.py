@@ -116,7 +116,7 @@ def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | No
 
 
 class _Layout(NamedTuple):
-    """Where the states of a grid lie: its width, where each action goes (0 north to 3 west), what stands in each cell."""
+    """Where the states of a grid lie: its width, where each action goes (0 north to 3 west), the sign of each cell."""
 
     num_columns: int
     directions: tuple[int, ...]
