@@ -106,6 +106,10 @@ class Chart:
     series: tuple[Series, ...]
     log_y: bool = False
 
+    def height_of(self, y: float) -> float:
+        """Where a value stands along the upward axis."""
+        return math.log10(max(y, 1e-12)) if self.log_y else y
+
 
 Drawing = GridDrawing | Chart
 

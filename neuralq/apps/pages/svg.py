@@ -105,11 +105,7 @@ def _arrow(arrow: Arrow, x: float, y: float, side: float) -> Iterator[str]:
 
 def _chart(chart: Chart) -> tuple[float, list[str]]:
     """Axes, a band and a line for each curve, and its name in its colour below."""
-
-    def height_of(y: float) -> float:
-        return math.log10(max(y, 1e-12)) if chart.log_y else y
-
-    shown = [height_of(y) for one in chart.series for part in (one.y, one.low, one.high) for y in part]
+    shown = [chart.height_of(y) for one in chart.series for part in (one.y, one.low, one.high) for y in part]
     xs = [x for one in chart.series for x in one.x]
     low, high = min(shown), max(shown)
     low, high = (low, high) if high > low else (low - 1, high + 1)
@@ -117,7 +113,7 @@ def _chart(chart: Chart) -> tuple[float, list[str]]:
 
     def place(x: float, y: float) -> str:
         across = _LEFT + (x - first) / (last - first) * (_WIDTH - _LEFT - _MARGIN)
-        return f"{across:.1f} {_PLOT_HEIGHT - (height_of(y) - low) / (high - low) * _PLOT_HEIGHT:.1f}"
+        return f"{across:.1f} {_PLOT_HEIGHT - (chart.height_of(y) - low) / (high - low) * _PLOT_HEIGHT:.1f}"
 
     lines = [f'<path d="M{_LEFT} 0V{_PLOT_HEIGHT}H{_WIDTH - _MARGIN}" fill="none" stroke="{_PALE}"/>']
     for level in (low, (low + high) / 2, high):

@@ -75,22 +75,18 @@ def _valued_block(cell: Square) -> list[str]:
 
 
 def _chart_lines(chart: Chart) -> list[str]:
-    values = [_height(y, chart.log_y) for one in chart.series for y in one.y if math.isfinite(y)]
+    values = [chart.height_of(y) for one in chart.series for y in one.y if math.isfinite(y)]
     low, high = min(values), max(values)
     width = max(len(one.name) for one in chart.series)
     scale = ", logarithmic" if chart.log_y else ""
     first, last = chart.series[0].x[0], chart.series[0].x[-1]
     lines = [f"{chart.y_label}{scale}, by {chart.x_label} {shown(first)} … {shown(last)}"]
-    return lines + [f"{one.name:>{width}} {_bars(one, low, high, chart.log_y)}" for one in chart.series]
+    return lines + [f"{one.name:>{width}} {_bars(one, low, high, chart)}" for one in chart.series]
 
 
-def _bars(one: Series, low: float, high: float, log_y: bool) -> str:
+def _bars(one: Series, low: float, high: float, chart: Chart) -> str:
     count = min(len(one.y), _BAR_COLUMNS)
     picked = [one.y[round(i * (len(one.y) - 1) / max(count - 1, 1))] for i in range(count)]
     top, span = len(_BARS) - 1, (high - low) or 1.0
-    bars = "".join(_BARS[min(top, max(0, round((_height(y, log_y) - low) / span * top)))] for y in picked)
+    bars = "".join(_BARS[min(top, max(0, round((chart.height_of(y) - low) / span * top)))] for y in picked)
     return f"{bars}  {shown(one.y[0])} → {shown(one.y[-1])}"
-
-
-def _height(y: float, log_y: bool) -> float:
-    return math.log10(max(y, 1e-12)) if log_y else y

@@ -69,7 +69,6 @@ class WaysToPlay:
         self.start: _Place = (position.own + position.other, left)
         self.ends = _ends(position, self.dice)
         self._next = self._grown()
-        self._kept: dict[_Place, bool] = {}
 
     def steps(self, place: _Place) -> dict[CheckerStep, _Place]:
         """The steps that may come next, each with where it leads; none if the turn ends here.
@@ -79,7 +78,7 @@ class WaysToPlay:
             >>> [notation([step]) for step in ways.steps(ways.start)]
             ['24/18', '13/7', '8/2', '13/8', '8/3']
         """
-        return {step: after for step, after in self._next[place].items() if self._can_end(after)}
+        return self._next[place]
 
     def paths(self) -> dict[bytes, tuple[CheckerStep, ...]]:
         """For each board in which the turn can end, own row first, one way to get there.
@@ -103,7 +102,7 @@ class WaysToPlay:
         return found
 
     def _grown(self) -> dict[_Place, dict[CheckerStep, _Place]]:
-        """Every place that single steps lead to, whether or not the turn may go that way."""
+        """The steps from every place that single steps lead to, those alone by which the turn can end as it must."""
         found: dict[_Place, dict[CheckerStep, _Place]] = {}
         frontier = [self.start]
         for place in frontier:  # grows while it is read
@@ -111,13 +110,13 @@ class WaysToPlay:
                 continue
             found[place] = _single_steps(place)
             frontier += found[place].values()
+        can_end = set()
+        for place in reversed(found):  # those with fewer dice left come first
+            stuck = not found[place]
+            found[place] = {step: after for step, after in found[place].items() if after in can_end}
+            if found[place] or (stuck and place[0] in self.ends):
+                can_end.add(place)
         return found
-
-    def _can_end(self, place: _Place) -> bool:
-        if place not in self._kept:
-            following = self._next[place]
-            self._kept[place] = any(map(self._can_end, following.values())) if following else place[0] in self.ends
-        return self._kept[place]
 
 
 class PartialTurn:
@@ -172,10 +171,8 @@ class PartialTurn:
         Several steps of one checker are one move where the order of the dice makes no difference; where it does (one
         order may hit) they are left to be made one by one. Of two dice that bear a checker off, the smaller is used.
         """
-        found: dict[int, dict[int, tuple[CheckerStep, ...]]] = {}
-        for source in {step.source for step in self.ways.steps(self._places[-1])}:
-            found[source] = self._targets(source)
-        return dict(sorted(found.items(), reverse=True))
+        sources = {step.source for step in self.ways.steps(self._places[-1])}
+        return {source: self._targets(source) for source in sorted(sources, reverse=True)}
 
     def move(self, source: int, target: int) -> tuple[CheckerStep, ...]:
         """Moves a checker, and returns its steps.

@@ -187,19 +187,15 @@ def _plotly_script() -> Path:
     assert spec is not None and spec.origin is not None
     script = Path(spec.origin).parent / "package_data" / "plotly.min.js"
     if not script.is_file():
-        raise MissingExtra(
-            f'{script} is missing; reinstall plotly with: pip install --force-reinstall "neuralq[web]"'
-        )  # fmt: skip
+        raise MissingExtra(f'{script} is missing; reinstall plotly with: pip install --force-reinstall "neuralq[web]"')
     return script
 
 
 def _is_loopback(host: str) -> bool:
-    if host.lower() == "localhost":
-        return True
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return False
+        return host.lower() == "localhost"
 
 
 def _is_everywhere(host: str) -> bool:
