@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process, linear_process
-from neuralq.lab.linear.sampling import sample_of_arcs, stream
+from neuralq.lab.linear.sampling import sample_along, stream
 from neuralq.lab.methods import Method
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem
@@ -41,18 +41,18 @@ def process_of(seed: int, pairs: bool = False, num_weights: int = 3) -> Process:
     return linear_process(uneven_problem(seed, pairs, num_weights))
 
 
-def mean_over_arcs(process: Process, one: Method, theta: Floats, step_size: float, **options: float) -> Floats:
-    """Exact mean of θ after one sampled update: over every arc and second arc with their chances, ``[size]``."""
-    arcs, target = process.arcs, process.target_arcs
+def mean_over_transitions(process: Process, one: Method, theta: Floats, step_size: float, **options: float) -> Floats:
+    """Exact mean of θ after one sampled update: over transitions and second successors by their chances, ``[size]``."""
+    transitions, target = process.transitions, process.target_transitions
     cases = [
-        (k, q, process.D[i] * arcs.probability[k] * target.probability[q])
-        for k, i in enumerate(arcs.row)
+        (k, q, process.D[i] * transitions.probability[k] * target.probability[q])
+        for k, i in enumerate(transitions.row)
         for q in range(target.starts[i], target.starts[i + 1])
     ]
-    arc, second, weight = (np.array(column) for column in zip(*cases, strict=True))
-    learner = one.learner(process, np.tile(theta[: process.num_weights], (len(arc), 1)), one.checked(options))
+    transition, second, weight = (np.array(column) for column in zip(*cases, strict=True))
+    learner = one.learner(process, np.tile(theta[: process.num_weights], (len(transition), 1)), one.checked(options))
     learner.theta[:] = theta
-    learner.update(sample_of_arcs(process, arc, second, np.ones(len(arc), dtype=bool)), step_size)
+    learner.update(sample_along(process, transition, second, np.ones(len(transition), dtype=bool)), step_size)
     return weight @ learner.theta
 
 
@@ -86,14 +86,14 @@ def assert_long_run(process: Process, one: Method, theta: Floats, **options: flo
 
 
 def assert_law(process: Process, one: Method, seed: int = 0, **options: float) -> None:
-    """At several θ the mean over arcs of the sampled update is the expected update."""
+    """At several θ the mean over transitions of the sampled update is the expected update."""
     rng = np.random.default_rng(seed)
     expected = one.expected(process, one.checked(options))
     for _ in range(expected.size + 2):
         theta = rng.normal(size=expected.size)
         M, c = expected.at(theta, 0.07)
         np.testing.assert_allclose(
-            mean_over_arcs(process, one, theta, 0.07, **options), M @ theta + c, rtol=0, atol=1e-12
+            mean_over_transitions(process, one, theta, 0.07, **options), M @ theta + c, rtol=0, atol=1e-12
         )
 
 

@@ -19,7 +19,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from neuralq.lab import expected_backup, expected_td_step, local_growth, predict_baird, run_baird
+from neuralq.lab import (
+    expected_backup,
+    expected_td_step,
+    local_growth,
+    predict_representations,
+    run_representations,
+)
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.baird import DASHED, SOLID
@@ -56,7 +62,7 @@ def test_linear_sweeps_are_the_books() -> None:
 
 @pytest.fixture(scope="module")
 def results() -> dict[str, object]:
-    return {result.representation: result for result in run_baird(num_steps=1500)}
+    return {result.representation: result for result in run_representations(star(), 1500)}
 
 
 @pytest.mark.slow
@@ -91,7 +97,7 @@ def test_the_linear_features_diverge_at_the_predicted_rate(results: dict) -> Non
     for _ in range(1000):
         before = backup.state_values(expected_td_step(q, backup, 0.05))
     after = backup.state_values(expected_td_step(q, backup, 0.05))
-    assert (after / before).tolist() == pytest.approx([predict_baird(step_size=0.05)[1].growth] * 7, rel=2e-6)
+    assert (after / before).tolist() == pytest.approx([predict_representations(star(), 0.05)[1].growth] * 7, rel=2e-6)
 
 
 def test_the_networks_verdict_is_local_and_their_values_rise(results: dict) -> None:  # type: ignore[type-arg]
@@ -103,7 +109,7 @@ def test_the_networks_verdict_is_local_and_their_values_rise(results: dict) -> N
 
 
 def test_predictions_are_those_of_the_run(results: dict) -> None:  # type: ignore[type-arg]
-    for prediction in predict_baird():
+    for prediction in predict_representations(star()):
         result = results[prediction.representation]
         assert (prediction.growth, prediction.scope, prediction.verdict) == (
             result.predicted_growth, result.prediction_scope, result.verdict)  # fmt: skip
@@ -116,7 +122,7 @@ def test_prediction_and_measurement_agree_on_both_sides_of_the_threshold(
     gamma: float, num_upper: int, verdict: str
 ) -> None:
     problem = star(num_upper)
-    (prediction,) = (p for p in predict_baird(gamma, 0.1, num_upper) if p.representation == "linear")
+    (prediction,) = (p for p in predict_representations(star(num_upper, gamma), 0.1) if p.representation == "linear")
     assert prediction.verdict == verdict
     # The same sweep with the matrix written out, far enough for the slow mode to show.
     x, d = problem.features, problem.state_distribution
@@ -128,28 +134,30 @@ def test_prediction_and_measurement_agree_on_both_sides_of_the_threshold(
 
 def test_a_wild_step_stops_on_the_cap_without_an_overflow() -> None:
     for step_size in (30.0, 1e200):
-        for result in run_baird(num_steps=100, step_size=step_size):
+        for result in run_representations(star(), 100, step_size):
             assert result.stopped_on_cap or result.representation not in ("table", "linear")
             assert np.isfinite(result.rmsve).all() and np.isfinite(result.values).all()
             assert np.isfinite(result.measured_growth)
 
 
 def test_runs_repeat_themselves_and_differ_by_seed() -> None:
-    first, again, other = (run_baird(num_steps=20, seed=seed)[3].rmsve for seed in (1, 1, 2))
+    first, again, other = (run_representations(star(), 20, seed=seed)[3].rmsve for seed in (1, 1, 2))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
 def test_broken_arguments_are_named() -> None:
-    for arguments, message in [
-        ({"gamma": 1.0}, "gamma must be below 1"),
-        ({"gamma": -0.1}, "gamma must lie in"),
-        ({"step_size": 0.0}, "step_size must be a finite number above 0"),
-        ({"num_steps": 3}, "num_steps must be a whole number of at least 4"),
-        ({"num_upper": 0}, "num_upper"),
-        ({"seed": -1}, "seed must be a whole number of at least 0"),
+    for gamma, arguments, message in [
+        (1.0, {}, "baird never ends, so it has no values with γ = 1"),
+        (0.99, {"step_size": 0.0}, "step_size must be a finite number above 0"),
+        (0.99, {"num_steps": 3}, "num_steps must be a whole number of at least 4"),
+        (0.99, {"seed": -1}, "seed must be a whole number of at least 0"),
     ]:
         with pytest.raises(ValueError, match=message):
-            run_baird(**arguments)  # type: ignore[arg-type]
+            run_representations(star(gamma=gamma), **arguments)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="gamma must lie in"):
+        star(gamma=-0.1)
+    with pytest.raises(ValueError, match="num_upper"):
+        star(0)
     with pytest.raises(ValueError, match="one row for each of 7 states, got 3"):
         expected_backup(star(), torch.arange(3))
 
@@ -224,6 +232,6 @@ def test_the_script_prints_what_its_docstring_says(
     monkeypatch.setenv("COLUMNS", "100")
     printed = runpy.run_path(str(script), run_name="__main__")["__doc__"]
     shown = capsys.readouterr().out
-    for text in ("gamma > 0.8824", "1.0023925", "0.9999857", "1.0037821", "at the initial weights"):
+    for text in ("γ > 0.8824", "1.0023925", "0.9999857", "1.0037821", "at the initial weights"):
         assert text in shown and text in printed
     assert "<svg" in picture.read_text()

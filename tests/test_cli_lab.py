@@ -86,7 +86,7 @@ def test_diagnose_passes_everything_on(capsys: Capture) -> None:
     assert found["verdict"] == "diverges" and found["second_moment_radius"] > 1
     assert answer(capsys, "diagnose", "baird", "--gamma", "0.88")["verdict"] == "converges"  # below 15/17 = .8824
     assert answer(capsys, "diagnose", "baird", "--gamma", "0.885")["verdict"] == "diverges"
-    assert answer(capsys, "diagnose", "baird", "--lambda_", "0.95")["options"]["lambda_"] == 0.95
+    assert answer(capsys, "diagnose", "baird", "--lambda", "0.95")["options"]["lambda_"] == 0.95
     ridge = answer(capsys, "diagnose", "w2w", "--method", "polyak-target", "--tau", "0.5", "--eta", "2")
     assert ridge["options"] == {"tau": 0.5, "eta": 2.0}
     assert answer(capsys, "diagnose", "baird", "--step-size", "0.02")["step_size"] == 0.02
@@ -95,9 +95,9 @@ def test_diagnose_passes_everything_on(capsys: Capture) -> None:
 
 def test_critical_finds_published_boundaries(capsys: Capture) -> None:
     assert answer(capsys, "critical", "baird", "--parameter", "gamma")["critical"] == pytest.approx(15 / 17, rel=1e-9)
-    found = answer(capsys, "critical", "baird", "--parameter", "lambda_")
+    found = answer(capsys, "critical", "baird", "--parameter", "lambda")
     assert found["stable"] == [[found["critical"], pytest.approx(1.0)]]
-    found = answer(capsys, "critical", "baird", "--parameter", "gamma", "--lambda_", "1", expected=1)  # never unstable
+    found = answer(capsys, "critical", "baird", "--parameter", "gamma", "--lambda", "1", expected=1)  # never unstable
     assert found["critical"] is None
     assert "no critical value" in refusal(capsys, "critical", "kolter", "--parameter", "tau")
 
@@ -183,7 +183,7 @@ def test_baird_from_every_side(capsys: Capture, monkeypatch: pytest.MonkeyPatch)
         (["diagnose", "nope"], 1, "no problem is called 'nope'"),
         (["diagnose", "baird", "--method", "nope"], 2, "invalid choice: 'nope'"),
         (["diagnose", "baird", "--tau", "3"], 2, "unrecognized arguments: --tau 3"),
-        (["diagnose", "baird", "--gamma", "1"], 1, "choose a --gamma below 1"),
+        (["diagnose", "baird", "--gamma", "1"], 1, "choose a gamma below 1"),
         (["diagnose", "baird", "--gamma", "2"], 1, "gamma must lie in [0, 1]"),
         (["diagnose", "baird", "--step-size", "-1"], 1, "step_size"),
         (["diagnose", "baird", "--method", "sarsa"], 1, "compares actions"),

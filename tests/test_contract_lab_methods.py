@@ -55,8 +55,8 @@ from numpy.typing import NDArray
 
 from neuralq.lab import Method, Problem, method
 from neuralq.lab.linear.process import Process, linear_process
-from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods import METHODS, Expected, Learner
+from neuralq.lab.linear.sampling import SampledTransition
+from neuralq.lab.methods import METHODS, Expected, SampledUpdate
 from neuralq.mdp import FiniteMDP
 
 Floats = NDArray[np.float64]
@@ -238,7 +238,9 @@ class World:
                 go_on(row, chance, [])
         return [ways for ways, _ in found], np.array([chance for _, chance in found])
 
-    def sample(self, way: Index, second: Index | None, begins: object, scale: Floats | float = 1.0) -> Sample:
+    def sample(
+        self, way: Index, second: Index | None, begins: object, scale: Floats | float = 1.0
+    ) -> SampledTransition:
         """Transitions along ways of the behaviour; where there is no second one, whoever reads it gets NaN.
 
         A ``scale`` √k of features and rewards makes a transition count k times in whatever is quadratic in them.
@@ -249,7 +251,7 @@ class World:
         if second is not None:
             ahead = self.features[self.target.next_row[second]]
             further = np.where(self.target.next_row[second] < 0, 0.0, self.gamma)
-        return Sample(
+        return SampledTransition(
             row=one.row[way],
             next_row=one.next_row[way],
             x=scale[:, None] * self.features[one.row[way]],
@@ -321,7 +323,7 @@ def world_of(kind: str, pairs: bool) -> World:
 
 def combinations(one: Method) -> Iterator[Options]:
     """Every combination of the values tried; the default of an option that TRIED does not know."""
-    values = [TRIED.get(f"{one.name}.{name}", TRIED.get(name, (one.options[name],))) for name in one.options]
+    values = [TRIED.get(f"{one.name}.{name}", TRIED.get(name, (one.options[name].default,))) for name in one.options]
     for chosen in itertools.product(*values):
         yield dict(zip(one.options, chosen, strict=True))
 
@@ -331,7 +333,7 @@ def expected_of(world: World, one: Method, options: Options) -> Expected:
     return one.expected(world.process, one.checked(options))
 
 
-def learner_of(world: World, one: Method, options: Options, thetas: Floats) -> Learner:
+def learner_of(world: World, one: Method, options: Options, thetas: Floats) -> SampledUpdate:
     """A learner whose seeds stand at the given θ, ``[N, size]``."""
     assert one.learner is not None
     learner = one.learner(world.process, thetas[:, : world.X.shape[-1]].copy(), one.checked(options))

@@ -21,7 +21,7 @@ from counterexample_algebra import Floats, chain, dense, fixed_point, rmspbe, rm
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuralq.lab.problems import PROBLEMS, Problem, garnet, garnet_on_policy, garnet_skewed, problem
+from neuralq.lab.problems import PROBLEMS, Problem, problem
 from neuralq.mdp import FiniteMDP
 from neuralq_envs import boyan as boyan_chain
 from neuralq_envs.counterexamples import (
@@ -36,6 +36,7 @@ from neuralq_envs.counterexamples import (
     w2w,
     walks,
 )
+from neuralq_envs.counterexamples.garnet import garnet
 
 # --- the list ---------------------------------------------------------------------------------------------------------
 
@@ -330,7 +331,7 @@ def test_collision_features_are_three_of_six_and_td_is_stable_on_them() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_garnets_are_random_but_the_same_for_a_seed(seed: int) -> None:
-    p, again, on_policy = garnet(seed=seed), garnet(seed=seed), garnet_on_policy(seed=seed)
+    p, again, on_policy = garnet(seed=seed), garnet(seed=seed), garnet(seed=seed, updates="target")
     for field in ("features", "target_policy", "behaviour_policy", "state_distribution"):
         np.testing.assert_array_equal(getattr(p, field), getattr(again, field))
         assert not np.array_equal(getattr(p, field), getattr(garnet(seed=seed + 100), field))
@@ -343,11 +344,11 @@ def test_garnets_are_random_but_the_same_for_a_seed(seed: int) -> None:
 
 
 def test_some_garnets_diverge() -> None:
-    def share(make) -> float:
-        return float(np.mean([slowest(make(gamma=0.99, seed=seed)) < 0 for seed in range(100)]))
+    def share(updates) -> float:
+        return float(np.mean([slowest(garnet(seed=seed, updates=updates)) < 0 for seed in range(100)]))
 
-    assert share(garnet_on_policy) == 0.0
-    assert 0.05 < share(garnet) < share(garnet_skewed) < 0.9
+    assert share("target") == 0.0
+    assert 0.05 < share("behaviour") < share("random") < 0.9
 
 
 # --- what a problem and a model refuse --------------------------------------------------------------------------------

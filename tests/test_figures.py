@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuralq.lab.figures import FIGURES, Curve, Drawing, Panel, png_of, svg_of
+from neuralq.lab.figures import FIGURES, Drawing, Panel, Series, png_of, svg_of
 from neuralq.lab.figures.cures import (
     figure_critical_curves,
     figure_representations,
@@ -27,13 +27,9 @@ from neuralq.lab.figures.cures import (
 from neuralq.lab.figures.fitted_grid import figure_fitted
 from neuralq.lab.figures.hall import figure_hall, modal_sweeps, predicted_sweeps, sweeps_until
 from neuralq.lab.figures.spiral import figure_spiral, spiral_updates
-from neuralq.lab.figures.star import chain_moments, figure_11_2, figure_11_5, figure_11_6
+from neuralq.lab.figures.star import figure_11_2, figure_11_5, figure_11_6
 from neuralq.lab.figures.states import figure_chattering, figure_kolter
-from neuralq.lab.linear.process import linear_process
-from neuralq.lab.methods import TD
-from neuralq.lab.verdicts.moments import evolve, jumps
 from neuralq_envs.counterexamples import star
-from neuralq_envs.counterexamples.walks import walk5
 
 SCRIPT = str(Path(__file__).parents[1] / "scripts" / "figures.py")
 
@@ -66,20 +62,6 @@ def test_figure_11_2() -> None:
         assert (ours.low <= ours.high).all() and (ours.y[0] == ours.low[0] == ours.high[0])
     # The standard error of w8 from 200,000 runs was .0051 / 4 standard errors at 400 seeds: 4 · .0051 · √500
     assert at(left, "w8", 100) == pytest.approx(9.597074, abs=0.46)
-
-
-def test_exact_moments_of_a_chain_are_those_of_evolve() -> None:
-    problem = star()
-    maps = jumps(linear_process(problem), TD, TD.checked({}), 0.01)
-    mean, second = chain_moments(maps, problem.initial_weights, np.array([0, 3, 40]))
-    np.testing.assert_allclose(mean[0], problem.initial_weights, rtol=1e-14)
-    for k, steps in enumerate((0, 3, 40)):
-        expected, covariance = evolve(maps, problem.initial_weights, steps, "markov")
-        np.testing.assert_allclose(mean[k], expected, rtol=1e-12)
-        np.testing.assert_allclose(second[k] - np.outer(mean[k], mean[k]), covariance, atol=1e-9)
-    ends = walk5()
-    with pytest.raises(ValueError, match="ends the episode"):
-        chain_moments(jumps(linear_process(ends), TD, TD.checked({}), 0.1), ends.initial_weights, np.array([1]))
 
 
 def test_figure_11_5() -> None:
@@ -253,10 +235,10 @@ def test_representations() -> None:
 def small_drawing() -> Drawing:
     x = np.arange(4.0)
     curves = (
-        Curve("ours", x, x * 1e3 + 0.123456789, low=x, high=x * 2e3),
-        Curve("exact", x, x, "dashed", 6),
-        Curve("points", x, np.array([1, np.nan, np.inf, 2]), "rings", 1),
-        Curve("unlisted", x, x, "dotted", listed=False),
+        Series("ours", x, x * 1e3 + 0.123456789, low=x, high=x * 2e3),
+        Series("exact", x, x, "dashed", 6),
+        Series("points", x, np.array([1, np.nan, np.inf, 2]), "rings", 1),
+        Series("unlisted", x, x, "dotted", listed=False),
     )
     panels = (Panel("p", "x", "y", curves), Panel("q", "x", "y", curves[:1], "log", "symlog", verticals=((2.0, "v"),)))
     return Drawing("small-one", "A title", "Nobody 1900", "What is exact & what is not.", panels)
@@ -283,7 +265,7 @@ def test_compact_svg_paints_what_matplotlib_does() -> None:
     """Every path of a line ends where the curve does, to a hundredth of a point."""
     pytest.importorskip("matplotlib", reason="the plot extra is not installed")
     drawing = small_drawing()
-    line = Curve("one", np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+    line = Series("one", np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
     panel = replace(drawing.panels[0], curves=(line,), x_limits=(0, 2), y_limits=(0, 1))
     text = svg_of(replace(drawing, panels=(panel,)), with_caption=False)
     paths = [re.findall(r"-?[\d.]+", d) for d in re.findall(r' d="(M[^"]*)"[^>]*stroke:#0072b2', text)]

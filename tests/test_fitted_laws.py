@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from fitted_models import derived_mdp, sweep_of_mdp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuralq.exact import solve
-from neuralq.lab.fitted.diagnosis import derived_mdp, hat_norm, is_averager, policy_growth
+from neuralq.lab import diagnose, run
+from neuralq.lab.fitted.diagnosis import hat_norm, is_averager, policy_growth
 from neuralq.lab.fitted.grow_support import greedy_costs, grow_support
-from neuralq.lab.fitted.iteration import fitted_iteration, iterate, sweep_of_mdp, sweep_of_model
+from neuralq.lab.fitted.iteration import fitted_iteration, iterate, sweep_of_model
 from neuralq.lab.fitted.regressors import (
     GridInterpolation,
     KernelSmoothing,
@@ -24,7 +26,6 @@ from neuralq.lab.fitted.regressors import (
     StateAggregation,
     quadratic_features,
 )
-from neuralq.lab.methods.fitted_finite import evaluation_matrix, fitted_evaluation, fitted_q_iteration
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples.boyan_moore import car_on_the_hill, gridworld, puddle_world
 from neuralq_envs.counterexamples.continuous import ContinuousModel, grid_support, random_support, reachable_mdp
@@ -126,15 +127,15 @@ def test_fitted_iteration_with_an_averager_is_exact_iteration_of_the_derived_mod
     mdp = FiniteMDP.garnet(8, 3, 3, seed=seed)
     support = rng.permutation(8)[:num_support]
     hat = rng.dirichlet(np.ones(num_support + 1), size=8)[:, :num_support]  # sums below 1: the rest is worth 0
-    run = iterate(sweep_of_mdp(mdp, support, hat), gamma=gamma, num_iterations=5000, tolerance=1e-13)
+    ran = iterate(sweep_of_mdp(mdp, support, hat), gamma=gamma, num_iterations=5000, tolerance=1e-13)
     # The oracle of the oracle: a dense backup of all states, of which the support is read off.
     v = np.zeros(8)
     dense = mdp.transition.toarray().reshape(8, 3, 8)
-    for _ in range(run.iterations):
+    for _ in range(ran.iterations):
         v = hat @ (mdp.reward.reshape(8, 3) + gamma * dense @ v).max(axis=1)[support]
-    np.testing.assert_allclose(run.values[-1], -v[support], atol=1e-9)
+    np.testing.assert_allclose(ran.values[-1], -v[support], atol=1e-9)
     exact = solve(derived_mdp(sweep_of_mdp(mdp, support, hat)), gamma, tol=1e-11)
-    np.testing.assert_allclose(run.targets, -exact.v, atol=1e-8)
+    np.testing.assert_allclose(ran.targets, -exact.v, atol=1e-8)
 
 
 @pytest.mark.parametrize("model", [GRID, puddle_world(), car_on_the_hill()], ids=lambda model: model.name)
@@ -142,10 +143,10 @@ def test_fitted_iteration_with_an_averager_is_exact_iteration_of_the_derived_mod
 def test_the_derived_model_of_a_continuous_problem_has_the_fixed_point_as_its_values(model: ContinuousModel, regressor):
     support = grid_support(model, 11)
     sweep = sweep_of_model(model, support, regressor)
-    run = iterate(sweep, gamma=0.9, num_iterations=2000, tolerance=1e-12)
+    ran = iterate(sweep, gamma=0.9, num_iterations=2000, tolerance=1e-12)
     exact = solve(derived_mdp(sweep), 0.9, tol=1e-10)
-    assert run.converged
-    np.testing.assert_allclose(run.targets, -exact.v, atol=1e-8)
+    assert ran.converged
+    np.testing.assert_allclose(ran.targets, -exact.v, atol=1e-8)
 
 
 def test_the_undiscounted_derived_model_too():
@@ -162,9 +163,9 @@ def test_terminal_states_discounts_and_missing_actions_enter_the_sweep():
     )  # fmt: skip
     sweep = sweep_of_mdp(mdp, [0, 1], np.array([[1.0, 0], [0, 1.0], [7.0, 7.0]]))
     np.testing.assert_allclose(iterate(sweep).targets, [-2.0, -2.0], atol=1e-9)  # 1 + ½ + ¼ + …, from 1 one step later
-    run = iterate(sweep, gamma=0.8, tolerance=1e-13)
-    np.testing.assert_allclose(run.targets, [-1 / 0.6, -0.8 / 0.6], atol=1e-9)  # 1 + .4 + .16 + …
-    np.testing.assert_allclose(run.targets, -solve(mdp, 0.8).v[:2], atol=1e-7)
+    ran = iterate(sweep, gamma=0.8, tolerance=1e-13)
+    np.testing.assert_allclose(ran.targets, [-1 / 0.6, -0.8 / 0.6], atol=1e-9)  # 1 + .4 + .16 + …
+    np.testing.assert_allclose(ran.targets, -solve(mdp, 0.8).v[:2], atol=1e-7)
     assert derived_mdp(sweep).num_rows == 3
 
 
@@ -187,19 +188,17 @@ def _two_states(gamma: float, epsilon: float) -> Problem:
 def test_the_factor_of_w_to_2w(gamma, epsilon):
     factor = (6 - 4 * epsilon) * gamma / 5  # Sutton & Barto 2018, equation 11.10
     problem = _two_states(gamma, epsilon)
-    assert evaluation_matrix(problem).item() == pytest.approx(factor)
-    run = fitted_evaluation(problem, num_iterations=5)
-    np.testing.assert_allclose(run.weights[:, 0], factor ** np.arange(len(run.weights)), rtol=1e-9)
-    assert run.growth == pytest.approx(factor)
+    assert diagnose(problem, "fitted").spectral_radius == pytest.approx(factor)
+    np.testing.assert_allclose(run(problem, "fitted", 5).path[:, 0], factor ** np.arange(6), rtol=1e-9)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.1, 0.25])
 def test_w_to_2w_diverges_beyond_its_threshold_only(epsilon):
     edge = 5 / (6 - 4 * epsilon)
-    above = fitted_evaluation(_two_states(min(edge * 1.01, 1.0), epsilon), num_iterations=5000)
-    below = fitted_evaluation(_two_states(edge * 0.99, epsilon), num_iterations=5000)
-    assert below.converged and not below.stopped_on_cap
-    assert above.stopped_on_cap == (edge * 1.01 <= 1) and np.isfinite(above.weights).all()
+    above = run(_two_states(min(edge * 1.01, 1.0), epsilon), "fitted", 5000)
+    below = run(_two_states(edge * 0.99, epsilon), "fitted", 5000)
+    assert not below.diverged.any() and below.path[-1] == pytest.approx(0.0, abs=1e-12)
+    assert above.diverged.all() == (edge * 1.01 <= 1) and np.isfinite(above.path).all()
 
 
 def test_regression_on_two_states_is_no_averager_and_its_growth_is_six_fifths_of_gamma():
@@ -208,8 +207,8 @@ def test_regression_on_two_states_is_no_averager_and_its_growth_is_six_fifths_of
     assert hat_norm(hat) == pytest.approx(6 / 5)  # rows 1/5, 2/5 and 2/5, 4/5: by hand
     sweep = sweep_of_mdp(_two_states(0.9, 0.0).mdp, [0, 1], hat)
     assert policy_growth(sweep, np.zeros(2, dtype=np.int64), 0.9) == pytest.approx(1.08)
-    run = iterate(sweep, gamma=0.9, start=[1.0, 2.0], num_iterations=5000)
-    assert run.stopped_on_cap and run.growth == pytest.approx(1.08)
+    ran = iterate(sweep, gamma=0.9, start=[1.0, 2.0], num_iterations=5000)
+    assert ran.stopped_on_cap and ran.growth == pytest.approx(1.08)
 
 
 @settings(max_examples=15, deadline=None)
@@ -218,13 +217,13 @@ def test_fitted_evaluation_finds_the_projected_fixed_point(seed):
     rng = np.random.default_rng(seed)
     mdp = FiniteMDP.garnet(7, 2, 3, seed=seed)
     problem = Problem.from_mdp(mdp, rng.normal(size=(7, 3)), gamma=0.7, target_policy=np.full((7, 2), 0.5))
-    run = fitted_evaluation(problem, num_iterations=3000)  # on-policy: a contraction in the norm of d
+    ran, found = run(problem, "fitted", 3000), diagnose(problem, "fitted")  # on-policy: a contraction in the norm of d
     chain = 0.5 * (mdp.transition.toarray()[0::2] + mdp.transition.toarray()[1::2])
     reward = 0.5 * (mdp.reward[0::2] + mdp.reward[1::2])
     x, d = problem.features, np.diag(problem.state_distribution)
     expected = np.linalg.solve(x.T @ d @ (x - 0.7 * chain @ x), x.T @ d @ reward)
-    assert run.converged and run.growth < 0.7 + 1e-9
-    np.testing.assert_allclose(run.weights[-1], expected, rtol=1e-6, atol=1e-8)
+    assert found.converges and found.spectral_radius < 0.7 + 1e-9
+    np.testing.assert_allclose(ran.path[-1], expected, rtol=1e-6, atol=1e-8)
 
 
 @settings(max_examples=15, deadline=None)
@@ -234,20 +233,19 @@ def test_fitted_q_iteration_with_a_table_is_value_iteration(seed):
     table = np.eye(10).reshape(5, 2, 10)
     d = np.random.default_rng(seed).dirichlet(np.ones(5))
     problem = Problem.from_mdp(mdp, table, gamma=0.8, state_distribution=d)
-    run = fitted_q_iteration(problem, num_iterations=500)
-    assert run.converged and run.growth == pytest.approx(0.8)
-    np.testing.assert_allclose(run.weights[-1].reshape(5, 2), solve(mdp, 0.8, tol=1e-11).q, atol=1e-8)
+    ran, found = run(problem, "fitted-q", 500), diagnose(problem, "fitted-q")
+    assert found.converges and found.spectral_radius == pytest.approx(0.8)
+    np.testing.assert_allclose(ran.path[-1].reshape(5, 2), solve(mdp, 0.8, tol=1e-11).q, atol=1e-8)
 
 
 def test_fitted_q_iteration_on_w_to_2w_diverges_and_on_its_table_does_not():
     mdp = _two_states(0.95, 0.0).mdp
     rough = Problem.from_mdp(mdp, [[[1.0]], [[2.0]]], gamma=0.95, state_distribution=[0.5, 0.5])
-    run = fitted_q_iteration(rough, num_iterations=5000)
-    assert run.stopped_on_cap and run.growth == pytest.approx(1.14)  # 6 · .95 / 5
+    for name in ("fitted-q", "fitted"):  # with one action both back up the same values of pairs
+        assert run(rough, name, 5000).diverged.all()
+        assert diagnose(rough, name).spectral_radius == pytest.approx(1.14)  # 6 · .95 / 5
     with pytest.raises(ValueError, match="state-action pairs"):
-        fitted_q_iteration(_two_states(0.9, 0.0))
-    with pytest.raises(ValueError, match="features of states"):
-        fitted_evaluation(rough)
+        run(_two_states(0.9, 0.0), "fitted-q")
 
 
 # Grow-Support

@@ -32,7 +32,7 @@ from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.moments import mean_radius, second_moment_radius
 from neuralq.lab.verdicts.piecewise import follow
 from neuralq.lab.verdicts.remedies import prescribe
-from neuralq.lab.verdicts.update_maps import jumps
+from neuralq.lab.verdicts.update_maps import update_maps
 from neuralq.lab.watch.advice import RunTraits
 from neuralq.lab.watch.growth import fit_growth
 from neuralq.lab.watch.monitor import DivergenceMonitor
@@ -270,7 +270,7 @@ def test_moments_of_one_another(seed: int, name: str) -> None:
     """The i.i.d. mean is the expected update; a mean square grows at least like its mean; a chain tends to both."""
     problem, one = random_problem(seed), method(name)
     process = linear_process(problem)
-    maps = jumps(process, one, one.checked({}), 0.05)
+    maps = update_maps(process, one, one.checked({}), 0.05)
     assert one.expected is not None
     M, c = one.expected(process, one.checked({})).at(np.zeros(1), 0.05)
     np.testing.assert_allclose(maps.mean()[0], M, atol=1e-12)
@@ -280,7 +280,7 @@ def test_moments_of_one_another(seed: int, name: str) -> None:
     on_chain = replace(problem, state_distribution=stationary(problem))
     apart = []
     for alpha in (1e-3, 1e-4):
-        maps = jumps(
+        maps = update_maps(
             linear_process(on_chain), one, one.checked({"tau": alpha} if name == "polyak-target" else {}), alpha
         )
         apart.append(abs(mean_radius(maps, "markov") - mean_radius(maps, "iid")))

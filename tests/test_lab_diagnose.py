@@ -20,7 +20,8 @@ from threadpoolctl import threadpool_limits
 
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.spectrum import first_crossing, flow_bound, limit_of, moving_spectrum
-from neuralq.lab.methods import TD, Expected, Method
+from neuralq.lab.methods import Expected, Method
+from neuralq.lab.methods.td import TD
 from neuralq.lab.problems import problem as named
 from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.piecewise import follow
@@ -50,7 +51,7 @@ def test_one_weight_by_hand() -> None:
     assert found.fixed_point_error == pytest.approx(0.0, abs=1e-12)
     assert not found.oscillates and found.doubling_time is None and found.rank == 1
     assert found.second_moment_radius is None and found.step_size_bound_second_moment is None
-    sampled = diagnose(one_weight(), sampling="iid")  # one arc: every sample is the expected update
+    sampled = diagnose(one_weight(), sampling="iid")  # one transition: every sample is the expected update
     assert sampled.second_moment_radius == pytest.approx(0.99**2)
     assert sampled.step_size_bound_second_moment == pytest.approx(20.0, rel=1e-8)
     assert diagnose(one_weight(), step_size=15.0).oscillates  # 1 − 1.5 < 0, still stable

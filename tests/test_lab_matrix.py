@@ -11,7 +11,9 @@ reason; the cap of a sampled run ignored; rows and columns exchanged; a table wh
 from __future__ import annotations
 
 import csv
+import importlib
 import math
+import pkgutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +21,7 @@ import numpy as np
 import pytest
 
 import neuralq.lab
-from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, Run, problem
-from neuralq.lab import comparison as matrix
-from neuralq.lab import trial as run
+from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, Trial, matrix, problem, run
 from neuralq.lab.comparison import ABSENT, NEUTRAL_BAND, Sampled, applies, outcome_of
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
@@ -37,7 +37,7 @@ def two_states(gamma: float, step_size: float = 0.1) -> Problem:
     )
 
 
-def record(curve: np.ndarray, left: int = -1) -> Run:
+def record(curve: np.ndarray, left: int = -1) -> Trial:
     """A run whose errors are given."""
     errors = np.asarray(curve, dtype=np.float64)[:, None]
     made = run(two_states(0.5), "td", num_steps=1)
@@ -189,11 +189,10 @@ def test_refusals() -> None:
 
 
 def test_the_labs_names_stay_functions_whatever_is_imported() -> None:
-    """`neuralq.lab.run` is a module and a function; whoever imports the module must not take the function away."""
-    import importlib
-
+    """The import of a module binds its name in the package, and must not take a function of that name away."""
+    for module in pkgutil.walk_packages(neuralq.lab.__path__, "neuralq.lab."):
+        importlib.import_module(module.name)
     for name in ("run", "critical", "diagnose", "prescribe", "matrix"):
-        importlib.import_module(f"neuralq.lab.{name}")
         assert callable(getattr(neuralq.lab, name)), name
     assert set(dir(neuralq.lab)) == set(neuralq.lab.__all__)
     assert all(getattr(neuralq.lab, name) is not None for name in neuralq.lab.__all__)

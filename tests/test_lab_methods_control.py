@@ -182,9 +182,9 @@ def test_what_is_refused() -> None:
         with pytest.raises(ValueError, match="state-action pairs"):
             one.learner(states, np.ones((1, 3)), one.checked({}))  # type: ignore[misc]
     with pytest.raises(ValueError, match="epsilon"):
-        SARSA.expected(process, {"epsilon": 1.5})  # type: ignore[misc]
+        SARSA.expected(process, SARSA.checked({"epsilon": 1.5}))  # type: ignore[misc]
     with pytest.raises(ValueError, match="epsilon"):
-        SARSA.learner(process, np.ones((1, 3)), {"epsilon": -0.1})  # type: ignore[misc]
+        SARSA.learner(process, np.ones((1, 3)), SARSA.checked({"epsilon": -0.1}))  # type: ignore[misc]
     one_sided = linear_process(star_control(solid_probability=1.0))
     with pytest.raises(ValueError, match="leaves some out"):
         SARSA.learner(one_sided, np.ones((1, 15)), {"epsilon": 0.1})  # type: ignore[misc]

@@ -22,8 +22,8 @@ import pytest
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process, linear_process
-from neuralq.lab.linear.sampling import Sample, sample_of_arcs, stream
-from neuralq.lab.methods import METHODS, Expected, Learner, method
+from neuralq.lab.linear.sampling import SampledTransition, sample_along, stream
+from neuralq.lab.methods import METHODS, Expected, SampledUpdate, method
 from neuralq.lab.methods.gq import greedy_rows
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
@@ -47,7 +47,7 @@ def generator_of(process: Process, name: str, **options: float) -> tuple[Floats,
     return generator
 
 
-def learner_of(process: Process, w0: Floats, name: str, **options: float) -> Learner:
+def learner_of(process: Process, w0: Floats, name: str, **options: float) -> SampledUpdate:
     one = method(name)
     assert one.learner is not None
     return one.learner(process, w0, one.checked(options))
@@ -92,18 +92,18 @@ def control_star(behaviour: Floats) -> Problem:
 
 
 def after_each_arc(process: Process, name: str, theta: Floats, step_size: float, **options: float) -> Floats:
-    """θ after the sampled update along every arc, from θ, ``[K, size]``."""
-    num_arcs = len(process.arcs.row)
-    arc = np.arange(num_arcs)
-    second = process.target_arcs.starts[process.arcs.row]
-    learner = learner_of(process, np.zeros((num_arcs, process.num_weights)), name, **options)
+    """θ after the sampled update along every transition, from θ, ``[K, size]``."""
+    num_transitions = len(process.transitions.row)
+    transition = np.arange(num_transitions)
+    second = process.target_transitions.starts[process.transitions.row]
+    learner = learner_of(process, np.zeros((num_transitions, process.num_weights)), name, **options)
     learner.theta[:] = theta
-    learner.update(sample_of_arcs(process, arc, second, np.ones(num_arcs, dtype=bool)), step_size)
+    learner.update(sample_along(process, transition, second, np.ones(num_transitions, dtype=bool)), step_size)
     return learner.theta
 
 
-def mean_over_arcs(process: Process, values: Floats) -> Floats:
-    weight = process.D[process.arcs.row] * process.arcs.probability
+def mean_over_transitions(process: Process, values: Floats) -> Floats:
+    weight = process.D[process.transitions.row] * process.transitions.probability
     return np.asarray(np.tensordot(weight, values, axes=1))
 
 
@@ -123,7 +123,7 @@ def test_the_mean_of_the_sampled_update_is_the_expected_one(name: str, problem: 
     expected = expected_of(process, name, **options)
     for theta in rng.normal(size=(expected.size + 2, expected.size)):
         M, c = expected.at(theta, 0.07)
-        mean = mean_over_arcs(process, after_each_arc(process, name, theta, 0.07, **options))
+        mean = mean_over_transitions(process, after_each_arc(process, name, theta, 0.07, **options))
         assert mean == pytest.approx(M @ theta + c, abs=1e-12, rel=1e-12)
     if expected.generator is not None:
         G, g = expected.generator
@@ -134,19 +134,19 @@ def test_the_mean_of_the_sampled_update_is_the_expected_one(name: str, problem: 
 
 @pytest.mark.parametrize("problem", [random_problem(1, False), random_problem(1, True), star()])
 def test_gtd2_mp_differs_from_its_mean_at_second_order_only(problem: Problem) -> None:
-    """One sample used twice: E[(I − αG_t + α²G_t²)] = I − αG + α²E[G_t²], with G_t from what GTD2 does on that arc."""
+    """One sample used twice: E[(I − αG_t + α²G_t²)] = I − αG + α²E[G_t²], with G_t from what GTD2 does there."""
     process, rng, a = linear_process(problem), np.random.default_rng(2), 0.05
     size = 2 * process.num_weights
     zero = after_each_arc(process, "gtd2", np.zeros(size), 1.0, beta_over_alpha=3.0)
     units = [after_each_arc(process, "gtd2", unit, 1.0, beta_over_alpha=3.0) - zero for unit in np.eye(size)]
     G_arc = np.eye(size) - np.stack(units, axis=-1)  # [K, size, size]
-    G, g = mean_over_arcs(process, G_arc), mean_over_arcs(process, zero)
+    G, g = mean_over_transitions(process, G_arc), mean_over_transitions(process, zero)
     M, c = expected_of(process, "gtd2-mp", beta_over_alpha=3.0).at(zero[0], a)
     assert pytest.approx(np.eye(size) - a * G + a**2 * G @ G, abs=1e-12) == M
     assert c == pytest.approx(a * g - a**2 * G @ g, abs=1e-12)
     theta = rng.normal(size=size)
-    mean = mean_over_arcs(process, after_each_arc(process, "gtd2-mp", theta, a, beta_over_alpha=3.0))
-    twice = mean_over_arcs(process, np.einsum("kij,kj->ki", G_arc, G_arc @ theta - zero))
+    mean = mean_over_transitions(process, after_each_arc(process, "gtd2-mp", theta, a, beta_over_alpha=3.0))
+    twice = mean_over_transitions(process, np.einsum("kij,kj->ki", G_arc, G_arc @ theta - zero))
     assert mean == pytest.approx(theta + a * (g - G @ theta) + a**2 * twice, abs=1e-11)
 
 
@@ -179,7 +179,9 @@ def test_the_long_run_mean_with_traces_is_the_expected_update(name: str, lambda_
     assert method(name).remembers(options) and not method(name).remembers({**options, "lambda_": 0.0})
 
 
-def by_hand(name: str, process: Process, samples: list[Sample], n: int, w: Floats, o: dict[str, float]) -> Floats:
+def by_hand(
+    name: str, process: Process, samples: list[SampledTransition], n: int, w: Floats, o: dict[str, float]
+) -> Floats:
     """θ of seed n after some samples: the textbook's lines, one transition at a time."""
     h, z, z_mu, e, before, a = np.zeros_like(w), 0 * w, 0 * w, 0 * w, 0.0, o["step_size"]
     b, lam = a * o["beta_over_alpha"], o.get("lambda_", 0.0)
@@ -399,7 +401,7 @@ def test_gq_needs_no_behaviour_that_takes_every_action_of_the_target() -> None:
     )  # fmt: skip
     process, theta = linear_process(problem), np.random.default_rng(1).normal(size=10)
     M, c = expected_of(process, "gq").at(theta, 0.1)
-    mean = mean_over_arcs(process, after_each_arc(process, "gq", theta, 0.1))
+    mean = mean_over_transitions(process, after_each_arc(process, "gq", theta, 0.1))
     assert mean == pytest.approx(M @ theta + c, abs=1e-12)
 
 
@@ -408,10 +410,20 @@ def test_ties_go_to_the_lowest_legal_action() -> None:
     greedy = greedy_rows(process, np.zeros(5))
     assert [process.pairs[k].tolist() for k in greedy] == [[0, 0], [1, 1], [2, 0], [3, 0]]  # type: ignore[index]
     learner = learner_of(process, np.zeros((1, 5)), "greedy-gq")
-    arc = np.flatnonzero((process.arcs.next_row >= 0) & (process.state[process.arcs.next_row] == 1))[:1]
+    transition = np.flatnonzero(
+        (process.transitions.next_row >= 0) & (process.state[process.transitions.next_row] == 1)
+    )[:1]
     learner.theta[0, 5:] = h = np.arange(1.0, 6.0)
-    learner.update(sample_of_arcs(process, arc, process.target_arcs.starts[process.arcs.row[arc]], np.ones(1, bool)), 1)
-    x, r = process.X[process.arcs.row[arc[0]]], process.arcs.reward[arc[0]]
+    learner.update(
+        sample_along(
+            process,
+            transition,
+            process.target_transitions.starts[process.transitions.row[transition]],
+            np.ones(1, bool),
+        ),
+        1,
+    )
+    x, r = process.X[process.transitions.row[transition[0]]], process.transitions.reward[transition[0]]
     assert learner.theta[0, :5] == pytest.approx(r * x - 0.9 * (x @ h) * process.X[greedy[1]])
 
 

@@ -15,9 +15,10 @@ import pytest
 from lab_laws import Floats, assert_law, assert_long_run, min_real, process_of
 
 from neuralq.lab.linear.process import Process, linear_process
-from neuralq.lab.linear.sampling import Sample, stream
+from neuralq.lab.linear.sampling import SampledTransition, stream
 from neuralq.lab.methods import Method
-from neuralq.lab.methods.multistep import EXPECTED_SARSA, NAIVE_Q, NSTEP, RETRACE, TREE_BACKUP, VTRACE
+from neuralq.lab.methods.multistep import NSTEP, VTRACE
+from neuralq.lab.methods.pair_traces import EXPECTED_SARSA, NAIVE_Q, RETRACE, TREE_BACKUP
 from neuralq.lab.methods.td import TD
 from neuralq_envs.counterexamples import star
 from neuralq_envs.counterexamples.emphatic import emphatic
@@ -33,7 +34,7 @@ def generator(one: Method, process: Process, **options: float) -> tuple[Floats, 
     return found
 
 
-def chain(process: Process, seed: int, num_steps: int) -> list[Sample]:
+def chain(process: Process, seed: int, num_steps: int) -> list[SampledTransition]:
     """One seed's transitions."""
     samples = stream(process, "markov", 1, np.random.default_rng(seed))
     return [next(samples) for _ in range(num_steps)]
@@ -115,7 +116,7 @@ def test_n_step_seeds_do_not_mix() -> None:
     for _ in range(60):
         sample = next(samples)
         together.update(sample, 0.05)
-        alone.update(Sample(*(getattr(sample, name)[3:4] for name in Sample.__slots__)), 0.05)
+        alone.update(SampledTransition(*(getattr(sample, name)[3:4] for name in SampledTransition.__slots__)), 0.05)
         np.testing.assert_allclose(together.theta[3:4], alone.theta, rtol=1e-13)
 
 
@@ -169,13 +170,13 @@ def test_v_trace_without_clipping_is_td(pairs: bool) -> None:
 
 
 def test_v_trace_has_the_values_of_the_clipped_policy() -> None:
-    """A table: V of π_ρ̄ ∝ min(ρ̄ μ, π), whatever c̄ and λ (Espeholt et al. 2018, section 4.1); evaluated from arcs."""
+    """A table: V of π_ρ̄ ∝ min(ρ̄ μ, π), whatever c̄ and λ (Espeholt et al. 2018, section 4.1)."""
     process = process_of(8).with_features(np.eye(3))
-    arcs = process.arcs
-    clipped = arcs.probability * np.minimum(0.9, arcs.rho)
-    total = np.bincount(arcs.row, weights=clipped)
-    P, r = np.zeros((3, 3)), np.bincount(arcs.row, weights=clipped * arcs.reward) / total
-    for row, following, p in zip(arcs.row, arcs.next_row, clipped, strict=True):
+    transitions = process.transitions
+    clipped = transitions.probability * np.minimum(0.9, transitions.rho)
+    total = np.bincount(transitions.row, weights=clipped)
+    P, r = np.zeros((3, 3)), np.bincount(transitions.row, weights=clipped * transitions.reward) / total
+    for row, following, p in zip(transitions.row, transitions.next_row, clipped, strict=True):
         if following >= 0:
             P[row, following] += p / total[row]
     value = np.linalg.solve(np.eye(3) - process.gamma * P, r)
@@ -209,7 +210,7 @@ def test_pairs_obey_the_forward_view(one: Method) -> None:
     pi, mu, row_of, X = process.target_policy, process.behaviour_policy, process.row_of, process.X
     assert row_of is not None
     learner = one.learner(process, theta[None].copy(), one.checked({"lambda_": lambda_}))  # type: ignore[misc]
-    episode: list[Sample] = []
+    episode: list[SampledTransition] = []
     done = 0
     measured = np.zeros(3)
     for sample in chain(process, 6, 100):
@@ -241,11 +242,11 @@ def test_pairs_obey_the_forward_view(one: Method) -> None:
 
 @pytest.mark.parametrize("one", OF_PAIRS, ids=lambda one: one.name)
 def test_operator_of_pairs_from_arcs(one: Method) -> None:
-    """A and b as sums over paths: what is traced is followed along the behaviour's arcs, each times its c."""
+    """A and b as sums over paths: what is traced is followed along the behaviour's transitions, each times its c."""
     process, lambda_ = process_of(12, pairs=True), 0.8
-    arcs, n = process.arcs, process.num_rows
+    transitions, n = process.transitions, process.num_rows
     P_c = np.zeros((n, n))
-    for row, following, chance in zip(arcs.row, arcs.next_row, arcs.probability, strict=True):
+    for row, following, chance in zip(transitions.row, transitions.next_row, transitions.probability, strict=True):
         if following >= 0:
             s, a = process.pairs[following]  # type: ignore[index]
             c = lambda_ * CUTS[one.name](process.target_policy[s, a], process.behaviour_policy[s, a])

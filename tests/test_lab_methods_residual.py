@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.sampling import stream
-from neuralq.lab.methods import Expected, Learner, Method
-from neuralq.lab.methods.residual_adaptive import RESIDUAL_ADAPTIVE, least_phi
-from neuralq.lab.methods.td import RESIDUAL
+from neuralq.lab.methods import Expected, Method, SampledUpdate
+from neuralq.lab.methods.residual import RESIDUAL, RESIDUAL_ADAPTIVE, least_phi
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 
@@ -28,7 +27,7 @@ def expected_of(process: Process, one: Method, **options: float) -> Expected:
     return one.expected(process, one.checked(options))
 
 
-def learner_of(process: Process, w0: Floats, **options: float) -> Learner:
+def learner_of(process: Process, w0: Floats, **options: float) -> SampledUpdate:
     assert RESIDUAL_ADAPTIVE.learner is not None
     return RESIDUAL_ADAPTIVE.learner(process, w0, RESIDUAL_ADAPTIVE.checked(options))
 

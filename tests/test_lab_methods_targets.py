@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lab_laws import assert_law, mean_over_arcs, min_real, process_of, radius
+from lab_laws import assert_law, mean_over_transitions, min_real, process_of, radius
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process, linear_process
-from neuralq.lab.linear.sampling import Sample, sample_of_arcs
+from neuralq.lab.linear.sampling import SampledTransition, sample_along
 from neuralq.lab.methods import method
 from neuralq.lab.methods.operators import covariance, cross
 from neuralq.lab.methods.targets import HARD_TARGET, POLYAK_TARGET, PROJECTED_TARGET, frozen_target_map
@@ -37,10 +37,10 @@ def polyak_radius(process: Process, step_size: float, tau: float) -> float:
     return radius(R.T @ M @ R)
 
 
-def along(process: Process, arc: NDArray[np.int64]) -> Sample:
-    """The transitions along given arcs."""
-    second = process.target_arcs.starts[process.arcs.row[arc]]
-    return sample_of_arcs(process, arc, second, np.ones(len(arc), dtype=bool))
+def along(process: Process, transition: NDArray[np.int64]) -> SampledTransition:
+    """The transitions along given transitions."""
+    second = process.target_transitions.starts[process.transitions.row[transition]]
+    return sample_along(process, transition, second, np.ones(len(transition), dtype=bool))
 
 
 @pytest.mark.parametrize("pairs", [False, True])
@@ -54,15 +54,15 @@ def test_the_law(pairs: bool) -> None:
 
 @pytest.mark.parametrize("period", [2, 3])
 def test_the_law_of_a_whole_period(period: int) -> None:
-    """Independent transitions: the exact mean over all sequences of T arcs, one after the other through the learner."""
+    """Independent transitions: the exact mean over all sequences of T, one after the other through the learner."""
     process, theta = process_of(5), np.array([0.4, -1.0, 0.3])
-    arcs = process.arcs
-    sequences = np.array(np.meshgrid(*[np.arange(len(arcs.row))] * period)).reshape(period, -1)
-    weight = np.prod((process.D[arcs.row] * arcs.probability)[sequences], axis=0)
+    transitions = process.transitions
+    sequences = np.array(np.meshgrid(*[np.arange(len(transitions.row))] * period)).reshape(period, -1)
+    weight = np.prod((process.D[transitions.row] * transitions.probability)[sequences], axis=0)
     options = HARD_TARGET.checked({"period": period, "eta": 0.1})
     learner = HARD_TARGET.learner(process, np.tile(theta, (sequences.shape[1], 1)), options)  # type: ignore[misc]
-    for arc in sequences:
-        learner.update(along(process, arc), 0.3)
+    for transition in sequences:
+        learner.update(along(process, transition), 0.3)
     expected = HARD_TARGET.expected(process, options)  # type: ignore[misc]
     M, c = expected.at(theta, 0.3)
     np.testing.assert_allclose(weight @ learner.theta, M @ theta + c, atol=1e-12)
@@ -75,7 +75,7 @@ def test_the_copy_is_made_after_every_period() -> None:
     learner = HARD_TARGET.learner(process, np.ones((1, 3)), {"period": 4.0, "eta": eta})  # type: ignore[misc]
     w = u = np.ones(3)
     for t in range(1, 31):
-        sample = along(process, np.array([t * 7 % len(process.arcs.row)]))
+        sample = along(process, np.array([t * 7 % len(process.transitions.row)]))
         x, target = sample.x[0], sample.reward[0] + sample.discount[0] * u @ sample.x_next[0]
         w = w + alpha * (sample.rho[0] * (target - w @ x) * x - eta * w)
         if t % 4 == 0:
@@ -116,7 +116,7 @@ def test_period_one_and_tau_one() -> None:
     np.testing.assert_allclose(M, M_td, atol=1e-14)
     np.testing.assert_allclose(c, c_td, atol=1e-14)
     both = np.concatenate([theta, 5 * theta])
-    after = mean_over_arcs(process, POLYAK_TARGET, both, 0.1, tau=1.0)
+    after = mean_over_transitions(process, POLYAK_TARGET, both, 0.1, tau=1.0)
     np.testing.assert_allclose(after[3:], theta, atol=1e-12)  # the w from before the update
 
 
@@ -212,8 +212,8 @@ def test_projection_by_hand() -> None:
     options = PROJECTED_TARGET.checked({"tau": 0.5, "ball_w": 1.0, "ball_u": 0.25})
     learner = PROJECTED_TARGET.learner(process, np.array([[3.0, 4.0]]), options)  # type: ignore[misc]
     learner.theta[:, 2:] = 0.0
-    arc = np.zeros(1, dtype=np.int64)
-    learner.update(sample_of_arcs(process, arc, arc, np.ones(1, dtype=bool)), 0.0)
+    transition = np.zeros(1, dtype=np.int64)
+    learner.update(sample_along(process, transition, transition, np.ones(1, dtype=bool)), 0.0)
     assert learner.theta[0] == pytest.approx([3.0, 4.0, 0.15, 0.2], rel=1e-12)
 
 

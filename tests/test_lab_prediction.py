@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neuralq.lab.problems import garnet, garnet_skewed
 from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq_envs.counterexamples import Problem
+from neuralq_envs.counterexamples.garnet import garnet
 
 Floats = NDArray[np.float64]
 Update = Callable[[Floats], Floats]
@@ -121,11 +121,11 @@ def ends_up_growing(step: Update, theta: Floats) -> bool:
 
 def drawn(seed: int) -> tuple[Problem, np.random.Generator]:
     rng = np.random.default_rng([seed, 77])
-    make = (garnet, garnet_skewed)[seed % 2]
+    updates = ("behaviour", "random")[seed % 2]
     size = int(rng.integers(3, 13))
     features = int(rng.integers(1, size + 1))
     gamma = float(rng.choice([0.5, 0.9, 0.95, 0.99, 0.999]))
-    return make(size, int(rng.integers(2, 5)), 2, features, gamma, seed), rng
+    return garnet(size, int(rng.integers(2, 5)), 2, features, gamma, seed, updates), rng  # type: ignore[arg-type]
 
 
 def case(name: str, seed: int) -> tuple[Problem, Update, dict[str, float], str, float, int]:

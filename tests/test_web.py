@@ -116,7 +116,7 @@ def test_everything_on_offer_is_accepted(client: TestClient) -> None:
     assert [one["name"] for one in offered["problems"]] == [entry.name for entry in PROBLEMS]
     assert [one["name"] for one in offered["methods"]] == [one.name for one in METHODS if one.expected is not None]
     for one in METHODS:
-        for option, value in one.options.items():
+        for option, value in one.defaults.items():
             assert field_of(one, option).accepts(value), (one.name, option)
 
 

@@ -19,28 +19,26 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.linear.sampling import Sampling
-from neuralq.lab.linear.spectrum import visible_process
 from neuralq.lab.methods import METHODS, Method
 from neuralq.lab.methods import method as method_named
+from neuralq.lab.plain import fields_of, plain
 from neuralq.lab.problems import PROBLEMS
 from neuralq.lab.problems import problem as problem_named
-from neuralq.lab.trial import CAP, Run, run
+from neuralq.lab.trial import CAP, Trial, run
 from neuralq.lab.verdicts.diagnosis import diagnose
-from neuralq.lab.verdicts.moments import second_moment_radius, unknowns
-from neuralq.lab.verdicts.update_maps import jumps
+from neuralq.lab.verdicts.moments import known_second_moment
 from neuralq.lab.verdicts.words import Verdict
-from neuralq.types import Floats
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem
 
 __all__ = ["ABSENT", "NEUTRAL_BAND", "Cell", "Matrix", "Sampled", "applies", "matrix", "outcome_of"]
@@ -60,7 +58,6 @@ ABSENT = {
 
 _APPLICATIONS = 10**9 + 7  # no multiple of the records: a cycle must not look like rest
 _STEPPED = (1_077, 10_777, 107_777)
-_MOST_UNKNOWNS = 5_000  # of a second moment that is looked at beside sampled runs
 _STILL = 1e-7  # share of the largest error that a curve at rest may still move, from rounding
 _EXPECTED: dict[Verdict, Outcome] = {
     "converges": "settles",
@@ -148,30 +145,21 @@ class Cell:
 
     def plain(self) -> dict[str, Any]:
         """The cell as text and numbers, the same keys for every cell; sampled ones only where it was sampled."""
-        row: dict[str, Any] = {
-            "problem": self.problem,
-            "method": self.method,
-            "predicted": self.predicted,
-            "spectral_radius": self.spectral_radius,
-            "measured": self.measured,
-            "growth": self.growth,
-            "num_steps": self.num_steps,
-            "neutral": self.neutral,
-            "agree": self.agree,
-            "absent": self.absent,
-        }
+        names = ("problem", "method", "predicted", "spectral_radius", "measured", "growth", "num_steps", "neutral")
+        row = fields_of(self, *names, "agree", "absent")
         if self.sampled is not None or self.sampled_absent is not None:
-            one = self.sampled
-            row |= {
-                "sampling": None if one is None else one.sampling,
-                "num_seeds": None if one is None else one.num_seeds,
-                "sampled_steps": None if one is None else one.num_steps,
-                "num_diverged": None if one is None else one.num_diverged,
-                "sampled_growth": None if one is None else one.growth,
-                "second_moment_radius": None if one is None else one.second_moment_radius,
-                "sampled_agree": None if one is None else one.agree,
-                "sampled_absent": self.sampled_absent,
-            }
+            for name in (
+                "sampling",
+                "num_seeds",
+                "num_steps",
+                "num_diverged",
+                "growth",
+                "second_moment_radius",
+                "agree",
+            ):
+                key = f"sampled_{name.removeprefix('num_')}" if name in row else name
+                row[key] = plain(getattr(self.sampled, name, None))
+            row["sampled_absent"] = self.sampled_absent
         return row
 
 
@@ -246,7 +234,7 @@ def applies(problem: Problem, method: str) -> str | None:
     return "actions" if method_named(method).rows == "pairs" and not problem.learns_q else None
 
 
-def outcome_of(record: Run, patient: bool = True) -> Outcome:
+def outcome_of(record: Trial, patient: bool = True) -> Outcome:
     """What a run did, from its own record: whether it passed the cap, and how far its errors moved at the end.
 
     Args:
@@ -264,7 +252,7 @@ def outcome_of(record: Run, patient: bool = True) -> Outcome:
     return _resting(record.steps, curves, patient)
 
 
-def _resting(steps: NDArray[np.int64], curves: Floats, patient: bool) -> Outcome:
+def _resting(steps: Indices, curves: Floats, patient: bool) -> Outcome:
     """By the fastest change of a curve in the third and in the last quarter."""
     speed = np.abs(np.diff(curves, axis=1)) / np.diff(steps)
     size, quarter = np.maximum(curves.max(axis=1), 1e-12), steps[-1] / 4
@@ -310,26 +298,22 @@ def matrix(
     rows = [entry.name for entry in PROBLEMS] if problems is None else problems
     made = [problem_named(row) if isinstance(row, str) else row for row in rows]
     columns = [method_named(name) for name in methods or [one.name for one in METHODS]]
-    total = len(made) * len(columns)
-
-    def cells() -> Iterator[Cell]:
-        for i, one in enumerate(made):
-            for j, chosen in enumerate(columns):
-                if progress is not None:
-                    progress(one.name, chosen.name, i * len(columns) + j, total)
-                absent = applies(one, chosen.name)
-                if absent is not None:
-                    yield Cell(one.name, chosen.name, absent)
-                    continue
-                yield _filled(one, chosen, sampling, num_seeds, num_steps, seed)
-
-    return Matrix(tuple(one.name for one in made), tuple(one.name for one in columns), tuple(cells()))
+    cells: list[Cell] = []
+    for one in made:
+        for chosen in columns:
+            if progress is not None:
+                progress(one.name, chosen.name, len(cells), len(made) * len(columns))
+            cells.append(_cell(one, chosen, sampling, num_seeds, num_steps, seed))
+    return Matrix(tuple(one.name for one in made), tuple(one.name for one in columns), tuple(cells))
 
 
-def _filled(problem: Problem, chosen: Method, sampling: Sampling, num_seeds: int, num_steps: int, seed: int) -> Cell:
+def _cell(problem: Problem, chosen: Method, sampling: Sampling, num_seeds: int, num_steps: int, seed: int) -> Cell:
+    absent = applies(problem, chosen.name)
+    if absent is not None:
+        return Cell(problem.name, chosen.name, absent)
     found = diagnose(problem, chosen)
     measured, growth, updates = _measured(problem, chosen)
-    sampled, absent = None, None
+    sampled = None
     if sampling != "expected":
         absent = "nonlinear" if problem.value is not None else "solves" if chosen.learner is None else None
         if absent is None:
@@ -346,7 +330,7 @@ def _measured(problem: Problem, chosen: Method) -> tuple[Outcome, float, int]:
     if problem.value is not None:
         return _nonlinear_run(problem)
     assert chosen.expected is not None
-    expected = chosen.expected(linear_process(problem), chosen.options)
+    expected = chosen.expected(linear_process(problem), chosen.defaults)
     lengths = (_APPLICATIONS * expected.updates_per_sweep,) if expected.linear else _STEPPED
     for length in lengths:
         record = run(problem, chosen.name, num_steps=length)
@@ -377,23 +361,11 @@ def _nonlinear_run(problem: Problem) -> tuple[Outcome, float, int]:
     return _resting(steps, np.array([errors]), patient=False), growth, _STEPPED[-1]
 
 
-def _sampled(
-    problem: Problem, chosen: Method, sampling: Sampling, num_seeds: int, num_steps: int, seed: int
-) -> Sampled | None:
+def _sampled(problem: Problem, chosen: Method, sampling: Sampling, *sizes: int) -> Sampled | None:
+    num_seeds, num_steps, seed = sizes
     try:
         record = run(problem, chosen.name, num_steps, None, sampling, num_seeds, seed)
     except ValueError:
         return None
-    second = _second_moment(problem, chosen, sampling)
+    second = known_second_moment(problem, chosen, chosen.defaults, problem.step_size, sampling)
     return Sampled(sampling, num_seeds, num_steps, int(record.diverged.sum()), record.growth, second)
-
-
-def _second_moment(problem: Problem, chosen: Method, sampling: Sampling) -> float | None:
-    """Growth of the mean square, for methods whose updates are independent random maps."""
-    process, _ = visible_process(linear_process(problem))
-    expected = None if chosen.expected is None else chosen.expected(process, chosen.options)
-    if expected is None or not expected.linear or chosen.remembers(chosen.options) or sampling == "expected":
-        return None
-    if unknowns(process, expected.size, sampling) > _MOST_UNKNOWNS:
-        return None
-    return second_moment_radius(jumps(process, chosen, chosen.options, problem.step_size), sampling)

@@ -1,7 +1,8 @@
 """Problems on which learning with function approximation fails, and the controls on which it must not.
 
-`PROBLEMS` lists one named instance of each; the constructors beside it take γ, ε, the number of states and so on. Your
-own are as good: ``Problem.from_mdp(mdp, features, gamma=.9)``, ``Problem.from_gymnasium("FrozenLake-v1", features)``.
+`PROBLEMS` lists one named instance of each; their constructors, in `neuralq_envs.counterexamples`, take γ, ε, the
+number of states and so on. Your own are as good: ``Problem.from_mdp(mdp, features, gamma=.9)``,
+``Problem.from_gymnasium("FrozenLake-v1", features)``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from neuralq_envs.counterexamples.boyan import boyan
 from neuralq_envs.counterexamples.chattering import chattering
 from neuralq_envs.counterexamples.collision import collision
 from neuralq_envs.counterexamples.emphatic import emphatic
-from neuralq_envs.counterexamples.garnet import garnet, garnet_on_policy, garnet_skewed
+from neuralq_envs.counterexamples.garnet import garnet
 from neuralq_envs.counterexamples.gordon import gordon, gordon_averager
 from neuralq_envs.counterexamples.hall import hall
 from neuralq_envs.counterexamples.kolter import kolter
@@ -34,43 +35,7 @@ from neuralq_envs.counterexamples.split import a_presplit, a_split, bellman_erro
 from neuralq_envs.counterexamples.w2w import w2w, w2w_on_policy, w2w_single
 from neuralq_envs.counterexamples.walks import walk5, walk19, walk_off_policy
 
-__all__ = [
-    "PROBLEMS",
-    "Entry",
-    "ParametricValue",
-    "Problem",
-    "a_presplit",
-    "a_split",
-    "bellman_error_left",
-    "bellman_error_right",
-    "bertsekas",
-    "boyan",
-    "chattering",
-    "collision",
-    "emphatic",
-    "garnet",
-    "garnet_on_policy",
-    "garnet_skewed",
-    "gordon",
-    "gordon_averager",
-    "hall",
-    "kolter",
-    "problem",
-    "spiral",
-    "star",
-    "star_1995",
-    "star_control",
-    "star_first_edition",
-    "star_low_gamma",
-    "star_on_policy",
-    "star_tabular",
-    "w2w",
-    "w2w_on_policy",
-    "w2w_single",
-    "walk5",
-    "walk19",
-    "walk_off_policy",
-]
+__all__ = ["PROBLEMS", "Entry", "ParametricValue", "Problem", "problem"]
 
 
 @dataclass(frozen=True)
@@ -127,8 +92,8 @@ PROBLEMS: tuple[Entry, ...] = (
     Entry("collision", collision),
     # random: whatever comes out
     Entry("garnet", garnet),
-    Entry("garnet-on-policy", garnet_on_policy),
-    Entry("garnet-skewed", garnet_skewed),
+    Entry("garnet-on-policy", partial(garnet, updates="target")),
+    Entry("garnet-skewed", partial(garnet, updates="random")),
 )
 """One instance of every problem, with its published parameters."""
 

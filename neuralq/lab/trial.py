@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +26,11 @@ from neuralq.lab.methods import Expected, Method
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Options, Piece
 from neuralq.lab.methods.operators import covariance, td
-from neuralq.types import Floats
+from neuralq.lab.plain import fields_of, plain
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem
 
-__all__ = ["CAP", "Run", "affine_power", "check_coverage", "run"]
+__all__ = ["CAP", "Trial", "affine_power", "check_coverage", "run"]
 
 
 CAP = 1e10
@@ -39,7 +41,7 @@ _MOST_RECORDS = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Trial:
     """What a method did on a problem.
 
     Args:
@@ -62,11 +64,11 @@ class Run:
     options: Options
     sampling: Sampling
     step_size: float
-    steps: NDArray[np.int64]
+    steps: Indices
     rmsve: Floats
     rmspbe: Floats
     weights: Floats
-    stopped_at: NDArray[np.int64]
+    stopped_at: Indices
     cap: float
     path: Floats
 
@@ -102,6 +104,18 @@ class Run:
         table: Floats = np.quantile(getattr(self, of), np.asarray(probabilities, dtype=np.float64), axis=1).T
         return table
 
+    def plain(self) -> dict[str, Any]:
+        """The settings, quantiles of both errors and the first seed's last weights, as JSON takes them."""
+        return {
+            **fields_of(self, "problem", "method", "options", "sampling", "step_size", "growth", "steps"),
+            "num_steps": int(self.steps[-1]),
+            "num_seeds": len(self.stopped_at),
+            "num_diverged": int(self.diverged.sum()),
+            "rmsve": plain(self.quantiles()),
+            "rmspbe": plain(self.quantiles(of="rmspbe")),
+            "weights": plain(self.weights[:1]),
+        }
+
 
 def run(
     problem: Problem,
@@ -112,7 +126,7 @@ def run(
     num_seeds: int = 1,
     seed: int = 0,
     options: Options | None = None,
-) -> Run:
+) -> Trial:
     """A method trained on a problem.
 
     Args:
@@ -236,8 +250,8 @@ class _Record:
         for rows, error in zip((self.rmsve, self.rmspbe), self._errors(w), strict=True):
             rows.append(np.where(alive, np.minimum(error, self.cap), self.cap))
 
-    def finish(self, problem: Problem, chosen: Method, options: Options, sampling: Sampling, alpha: float) -> Run:
-        return Run(
+    def finish(self, problem: Problem, chosen: Method, options: Options, sampling: Sampling, alpha: float) -> Trial:
+        return Trial(
             problem.name, chosen.name, options, sampling, alpha, np.array(self.steps, dtype=np.int64),
             np.array(self.rmsve), np.array(self.rmspbe), self.weights, self.stopped_at, self.cap,
             np.array(self.path),
@@ -254,7 +268,7 @@ def _record_steps(num_steps: int) -> list[int]:
 
 def _expected_run(
     problem: Problem, process: Process, chosen: Method, options: Options, num_steps: int, alpha: float
-) -> Run:
+) -> Trial:
     if chosen.expected is None:
         raise ValueError(f"{chosen.title} has no expected update; use sampling='iid' or 'markov'")
     expected = chosen.expected(process, options)
@@ -294,7 +308,7 @@ def _sweeps(expected: Expected, theta: Floats, alpha: float, count: int, cap: fl
 def _sampled_run(
     problem: Problem, process: Process, chosen: Method, options: Options, num_steps: int, alpha: float,
     sampling: Sampling, num_seeds: int, rng: np.random.Generator,
-) -> Run:  # fmt: skip
+) -> Trial:  # fmt: skip
     assert sampling != "expected"
     if chosen.learner is None:
         raise ValueError(f"{chosen.title} has no update from single transitions; use sampling='expected'")

@@ -12,15 +12,12 @@ are λ = 4/9 and 1/3 < β < √½: ETD itself, β = γ, is stable in the mean an
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from neuralq.checks import check_discount
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples.problem import Problem
 
-__all__ = ["LEFT", "RIGHT", "critical_lambda", "emphatic", "follow_on_window"]
+__all__ = ["LEFT", "RIGHT", "emphatic"]
 
 LEFT, RIGHT = 0, 1
 
@@ -53,35 +50,3 @@ def emphatic(gamma: float = 0.9) -> Problem:
         known="TD(0) diverges iff γ > 5/6, TD(λ) is stable iff λ > 6 − 5/γ. Emphatic TD is stable in the mean for "
         "every γ below 1, but its follow-on trace has infinite variance from γ = √½ on.",
     )
-
-
-def critical_lambda(gamma: float = 0.9) -> float:
-    """TD(λ) is stable iff λ > 6 − 5/γ; below 0 means for every λ.
-
-    Raises:
-        ValueError: γ outside (0, 1].
-
-    Example:
-        >>> round(critical_lambda(0.9), 12) == round(4 / 9, 12)
-        True
-    """
-    check_discount("gamma", gamma)
-    if gamma == 0:
-        raise ValueError("gamma must be above 0, got 0: without bootstrapping there is no threshold in lambda")
-    return 6.0 - 5.0 / gamma
-
-
-def follow_on_window(gamma: float = 0.9) -> tuple[float, float]:
-    """ETD(0, β) is stable in the mean with a follow-on trace of finite variance for β in this open interval.
-
-    The interval is (max(0, (6γ − 5)/(3 − 2γ)), √½); it is empty where its first end is the larger.
-
-    Raises:
-        ValueError: γ outside [0, 1].
-
-    Example:
-        >>> [round(beta, 6) for beta in follow_on_window(0.9)]
-        [0.333333, 0.707107]
-    """
-    check_discount("gamma", gamma)
-    return max(0.0, (6 * gamma - 5) / (3 - 2 * gamma)), math.sqrt(0.5)

@@ -9,16 +9,16 @@ few features or many branches divergence is rare; with the defaults one in seven
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.checks import check_whole
+from neuralq.checks import check_choice, check_whole
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples.problem import Problem
 
-__all__ = ["garnet", "garnet_on_policy", "garnet_skewed"]
+__all__ = ["garnet"]
 
 
 def garnet(
@@ -28,95 +28,59 @@ def garnet(
     num_features: int = 8,
     gamma: float = 0.99,
     seed: int = 0,
+    updates: Literal["behaviour", "target", "random"] = "behaviour",
 ) -> Problem:
     """A random model, features and two policies; states are updated as often as the behaviour visits them.
 
+    Args:
+        num_states: of the model.
+        num_actions: legal in every state.
+        branching: successors of each pair.
+        num_features: d.
+        gamma: γ.
+        seed: of all that is random.
+        updates: ``"behaviour"``; ``"target"`` for the target as behaviour, on-policy; or ``"random"`` for a random
+            distribution that has nothing to do with either policy, as a replay memory of unknown origin amounts to: TD
+            diverges more often there.
+
     Raises:
-        ValueError: a number below 1, γ outside [0, 1], or a model that falls into separate parts (see `FiniteMDP`);
-            more branches prevent that.
+        ValueError: a number below 1, γ outside [0, 1], other updates, or a model that falls into separate parts (see
+            `FiniteMDP`); more branches prevent that.
 
     Example:
         >>> problem = garnet(seed=1)
         >>> problem.features.shape, bool(problem.state_distribution.min() > 0)
         ((10, 8), True)
+        >>> bool((garnet(seed=1, updates="target").importance_ratio == 1).all())
+        True
     """
     check_whole("num_features", num_features)
     check_whole("seed", seed, minimum=0)
+    check_choice("updates", updates, ("behaviour", "target", "random"))
     model = FiniteMDP.garnet(num_states, num_actions, branching, seed=seed)
     rng = np.random.default_rng([seed, 1])  # not the stream that drew the model
     features = rng.standard_normal((num_states, num_features))
     target, behaviour = (_policy(rng, num_states, num_actions) for _ in range(2))
+    skewed = np.random.default_rng([seed, 2]).dirichlet(np.full(num_states, 0.5)) if updates == "random" else None
+    name, words = {
+        "behaviour": ("garnet", ""),
+        "target": ("garnet-on-policy", ", on-policy"),
+        "random": ("garnet-skewed", ", updated at random"),
+    }[updates]
     return Problem.from_mdp(
         model,
         features,
         gamma=gamma,
         target_policy=target,
-        behaviour_policy=behaviour,
+        behaviour_policy=target if updates == "target" else behaviour,
+        state_distribution=skewed,
         step_size=0.05,
-        name="garnet",
-        title=f"Random problem {seed}",
+        name=name,
+        title=f"Random problem {seed}{words}",
         source="Archibald, McKinnon & Thomas 1995",
-        known="Off-policy: nothing is promised.",
-    )
-
-
-def garnet_on_policy(
-    num_states: int = 10,
-    num_actions: int = 3,
-    branching: int = 2,
-    num_features: int = 8,
-    gamma: float = 0.99,
-    seed: int = 0,
-) -> Problem:
-    """The same random model, features and target as `garnet`, with the target as behaviour.
-
-    Raises:
-        ValueError: as `garnet`.
-
-    Example:
-        >>> bool((garnet_on_policy(seed=1).importance_ratio == 1).all())
-        True
-    """
-    problem = garnet(num_states, num_actions, branching, num_features, gamma, seed)
-    return Problem.from_mdp(
-        problem.mdp,
-        problem.features,
-        gamma=gamma,
-        target_policy=problem.target_policy,
-        step_size=problem.step_size,
-        name="garnet-on-policy",
-        title=f"Random problem {seed}, on-policy",
-        source=problem.source,
-        known="On-policy: TD(0) converges for every γ below 1.",
-    )
-
-
-def garnet_skewed(
-    num_states: int = 10,
-    num_actions: int = 3,
-    branching: int = 2,
-    num_features: int = 8,
-    gamma: float = 0.99,
-    seed: int = 0,
-) -> Problem:
-    """The same as `garnet`, with states updated by a random distribution that has nothing to do with either policy.
-
-    What a replay memory of unknown origin amounts to; TD diverges more often than under `garnet`.
-
-    Raises:
-        ValueError: as `garnet`.
-
-    Example:
-        >>> bool(np.abs(garnet_skewed(seed=1).state_distribution - garnet(seed=1).state_distribution).max() > 0.05)
-        True
-    """
-    problem = garnet(num_states, num_actions, branching, num_features, gamma, seed)
-    rng = np.random.default_rng([seed, 2])
-    return replace(
-        problem,
-        name="garnet-skewed",
-        title=f"Random problem {seed}, updated at random",
-        state_distribution=rng.dirichlet(np.full(num_states, 0.5)),
+        known="On-policy: TD(0) converges for every γ below 1."
+        if updates == "target"
+        else "Off-policy: nothing is promised.",
     )
 
 

@@ -13,12 +13,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from neuralq_envs.counterexamples.problem import Problem
 from neuralq_envs.counterexamples.w2w import w2w
 
-__all__ = ["gordon", "gordon_averager", "hat_matrix", "is_averager"]
+__all__ = ["gordon", "gordon_averager"]
 
 
 def gordon(gamma: float = 0.9) -> Problem:
@@ -28,8 +27,8 @@ def gordon(gamma: float = 0.9) -> Problem:
         ValueError: γ outside [0, 1].
 
     Example:
-        >>> hat_matrix(gordon()).round(12).tolist()
-        [[0.2, 0.4], [0.4, 0.8]]
+        >>> gordon().features.tolist(), gordon().gamma
+        ([[1.0], [2.0]], 0.9)
     """
     return replace(
         w2w(gamma, epsilon=0.0),
@@ -48,8 +47,8 @@ def gordon_averager(gamma: float = 0.9) -> Problem:
         ValueError: γ outside [0, 1].
 
     Example:
-        >>> hat_matrix(gordon_averager()).round(12).tolist()
-        [[0.5, 0.5], [0.5, 0.5]]
+        >>> gordon_averager().features.tolist()
+        [[1.0], [1.0]]
     """
     return replace(
         gordon(gamma),
@@ -58,31 +57,3 @@ def gordon_averager(gamma: float = 0.9) -> Problem:
         title="Gordon's averager",
         known="The hat matrix averages, so the iteration contracts by γ in the maximum norm.",
     )
-
-
-def hat_matrix(problem: Problem) -> NDArray[np.float64]:
-    """Least squares weighted by d fits ŷ = H y with H = X (XᵀDX)⁺ XᵀD, ``[S, S]``.
-
-    Raises:
-        ValueError: features of pairs.
-
-    Example:
-        >>> hat_matrix(w2w()).sum(axis=1).round(12).tolist()
-        [0.6, 1.2]
-    """
-    if problem.learns_q:
-        raise ValueError(f"the hat matrix needs features of states, [S, d], got shape {problem.features.shape}")
-    root = np.sqrt(problem.state_distribution)
-    fitted: NDArray[np.float64] = problem.features @ np.linalg.pinv(root[:, None] * problem.features) * root
-    return fitted
-
-
-def is_averager(hat: ArrayLike, tolerance: float = 1e-12) -> bool:
-    """Whether no entry of H is negative and no row sums to more than 1.
-
-    Example:
-        >>> is_averager([[0.5, 0.5], [0.2, 0.3]]), is_averager([[0.2, 0.4], [0.4, 0.8]])
-        (True, False)
-    """
-    matrix = np.asarray(hat, dtype=np.float64)
-    return bool((matrix >= -tolerance).all() and (matrix.sum(axis=-1) <= 1 + tolerance).all())

@@ -20,7 +20,7 @@ from neuralq.checks import check_fraction
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples.problem import Problem
 
-__all__ = ["critical_gamma", "least_squares_factor", "w2w", "w2w_on_policy", "w2w_single"]
+__all__ = ["critical_gamma", "w2w", "w2w_on_policy", "w2w_single"]
 
 
 def w2w(gamma: float = 0.99, epsilon: float = 0.1) -> Problem:
@@ -108,17 +108,3 @@ def critical_gamma(epsilon: float) -> float:
     """
     check_fraction("epsilon", epsilon)
     return 5.0 / (6.0 - 4.0 * epsilon)
-
-
-def least_squares_factor(gamma: float, epsilon: float) -> float:
-    """Refitting by least squares multiplies w by γ(6 − 4ε)/5.
-
-    Raises:
-        ValueError: γ or ε outside [0, 1].
-
-    Example:
-        >>> round(least_squares_factor(0.99, 0.1), 12)
-        1.1088
-    """
-    check_fraction("gamma", gamma)
-    return gamma / critical_gamma(epsilon)

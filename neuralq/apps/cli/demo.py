@@ -5,23 +5,25 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.progress import training_bar
-from neuralq.apps.pages.star import write_demo_report
-from neuralq.lab import BairdPrediction, BairdResult, predict_baird, run_baird
+from neuralq.apps.pages.star import divergence_svg, write_demo_report
+from neuralq.lab import Problem, RepresentationResult, predict_representations, run_representations
 from neuralq.runs import Run, RunConfig, preset_for, train
 from neuralq.runs.control import CONTROL
 from neuralq.runs.folder.run_folder import is_run_folder, read_metrics
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq_envs.counterexamples import star
+from neuralq_envs.counterexamples.baird import critical_gamma
 
-__all__ = ["baird", "demo", "plain_star", "show_star"]
+__all__ = ["add_star", "baird", "demo", "show_star", "star_console", "star_of"]
 
 TARGET = 475.0
 
@@ -40,7 +42,7 @@ def demo(argv: list[str]) -> int:
     began = time.perf_counter()
     console = Console(file=sys.stderr)
     run = _cartpole(folder / "cartpole", options.seed, console)
-    predictions, results = show_star(console, num_steps=5000, gamma=0.99, step_size=0.01, num_upper=6)
+    results = show_star(console, star(), num_steps=5000)
     facts = {
         "environment": "CartPole-v1",
         "environment steps": run.env_steps,
@@ -50,7 +52,7 @@ def demo(argv: list[str]) -> int:
     }
     path = write_demo_report(folder / "report.html", read_metrics(run.run_dir), facts, results, target=TARGET)
     seconds = time.perf_counter() - began
-    plain = {**run.plain(), "report": str(path), "seconds": seconds, "baird": plain_star(predictions, results)}
+    plain = {**run.plain(), "report": str(path), "seconds": seconds, "baird": [one.plain() for one in results]}
     print_result(plain, options.json, [f"report: {path} ({seconds:.0f} s in all)"])
     if not run.reached:
         raise Failure(f"CartPole-v1 did not reach {TARGET:g} with seed {options.seed}; try another seed")
@@ -83,55 +85,57 @@ def baird(argv: list[str]) -> int:
         "baird",
         "Baird's star: what each representation will do under the same update, and what it does.",
         "neuralq baird --gamma 0.85",
+        "neuralq baird --svg star.svg",
     )
-    parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99; the threshold is 15/17)")
-    parser.add_argument("--step-size", type=float, default=0.01, help="α (default: 0.01)")
-    parser.add_argument("--num-upper", type=int, default=6, help="upper states of the star (default: 6)")
-    parser.add_argument("--num-steps", type=int, default=5000, help="sweeps (default: 5000)")
+    add_star(parser)
+    parser.add_argument("--svg", metavar="FILE", help="also draw the errors (extra: plot)")
     options = parser.parse_args(argv)
-    predictions, results = show_star(
-        Console(file=sys.stderr), options.num_steps, options.gamma, options.step_size, options.num_upper
-    )
-    print_result({"baird": plain_star(predictions, results)}, options.json, [])
+    results = show_star(star_console(options), star_of(options), options.num_steps, options.seed)
+    if options.svg is not None:
+        Path(options.svg).write_text(divergence_svg(results), encoding="utf-8")
+    print_result({"baird": [one.plain() for one in results]}, options.json, [])
     return 0
 
 
-def show_star(
-    console: Console, num_steps: int, gamma: float, step_size: float, num_upper: int
-) -> tuple[list[BairdPrediction], list[BairdResult]]:
-    """Print what is predicted of each representation of the star, then what is measured; both are returned."""
+def add_star(parser: ArgumentParser) -> None:
+    """The arguments that say which star is meant, and how long it is run."""
+    parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99; the threshold is 15/17)")
+    parser.add_argument("--step-size", type=float, default=0.01, help="α (default: 0.01)")
+    parser.add_argument("--num-upper", type=int, default=6, help="upper states of the star (default: 6)")
+    parser.add_argument("--num-steps", type=int, default=5000, help="sweeps of each representation (default: 5000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the networks' initial weights (default: 0)")
+
+
+def star_of(options: Namespace) -> Problem:
+    """The star that the arguments of `add_star` name."""
+    return replace(star(options.num_upper, options.gamma), step_size=options.step_size)
+
+
+def star_console(options: Namespace) -> Console:
+    """Where tables go; with ``--json`` they are progress."""
+    return Console(file=sys.stderr if options.json else sys.stdout)
+
+
+def show_star(console: Console, problem: Problem, num_steps: int, seed: int = 0) -> list[RepresentationResult]:
+    """Print what is predicted of each representation of a star, then what is measured."""
+    edge = critical_gamma(problem.mdp.num_states - 1)
     console.print(
-        f"[bold]Baird's star[/bold], γ={gamma:g}, α={step_size:g}: the prediction, before anything is trained",
+        f"[bold]Baird's star[/bold], γ={problem.gamma:g}, α={problem.step_size:g}: the prediction, before anything is "
+        f"trained; expected TD diverges for {f'γ > {edge:.4f}' if edge < 1 else 'no γ'}",
         soft_wrap=True,
     )
-    predictions = predict_baird(gamma, step_size, num_upper)
-    for p in predictions:
+    for p in predict_representations(problem, seed=seed):
+        where = "everywhere" if p.scope == "global" else "at the initial weights"
         console.print(
-            f"   {p.representation:<14} ×{p.growth:.7f} per sweep: {p.verdict} ({p.scope})",
-            highlight=False,
-            soft_wrap=True,
+            f"   {p.representation:<14} ×{p.growth:.7f} per sweep: {p.verdict} {where}", highlight=False, soft_wrap=True
         )
     with console.status(f"running {num_steps:,} sweeps of each representation"):
-        results = run_baird(num_steps, gamma, step_size, num_upper)
-    table = Table("representation", "predicted", "measured", "largest |V|", "exact V", title="measured")
+        results = run_representations(problem, num_steps, seed=seed)
+    table = Table("representation", "predicted", "measured", "sweeps", "largest |V|", "exact V", title="measured")
     for r in results:
         largest = f"{abs(r.values).max():.4g}" + (" (stopped)" if r.stopped_on_cap else "")
         exact = f"{abs(r.exact_values).max():g}"
-        table.add_row(r.representation, f"{r.predicted_growth:.7f}", f"{r.measured_growth:.7f}", largest, exact)
+        growths = f"{r.predicted_growth:.7f}", f"{r.measured_growth:.7f}"
+        table.add_row(r.representation, *growths, f"{r.steps:,}", largest, exact)
     console.print(table)
-    return predictions, results
-
-
-def plain_star(predictions: Sequence[BairdPrediction], results: Sequence[BairdResult]) -> list[dict[str, Any]]:
-    """Predictions and results as JSON takes them."""
-    return [
-        {
-            "representation": r.representation,
-            "predicted_growth": p.growth,
-            "prediction_scope": p.scope,
-            "verdict": p.verdict,
-            "measured_growth": r.measured_growth,
-            "stopped_on_cap": r.stopped_on_cap,
-        }
-        for p, r in zip(predictions, results, strict=True)
-    ]
+    return results

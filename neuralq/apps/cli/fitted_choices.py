@@ -20,6 +20,7 @@ from neuralq.lab.fitted.regressors import (
     StateAggregation,
     linear_features,
 )
+from neuralq.lab.plain import fields_of
 from neuralq_envs.counterexamples.boyan_moore import car_on_the_hill, gridworld, puddle_world
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
@@ -108,12 +109,8 @@ def fitted_table() -> Table:
 
 def plain_choices() -> dict[str, list[dict[str, Any]]]:
     """The same for programs."""
+    worlds, names = [make() for make in WORLDS], ("name", "title", "source")
     return {
-        "worlds": [
-            {"name": one.name, "title": one.title, "source": one.source, "known": one.known}
-            for one in (make() for make in WORLDS)
-        ],
-        "regressors": [
-            {"name": one.name, "title": one.title, "source": one.source, "option": one.option} for one in REGRESSORS
-        ],
+        "worlds": [fields_of(one, *names, "known") for one in worlds],
+        "regressors": [fields_of(one, *names, "option") for one in REGRESSORS],
     }

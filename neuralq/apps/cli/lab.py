@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from neuralq.apps.cli import CommandParser, Failure, command_parser, print_result
+from neuralq.apps.cli import CommandParser, Failure, command_parser, option_as_typed, print_result
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-    from neuralq.lab import Problem
+    from neuralq.lab import Method, Problem
 
-__all__ = ["COMMANDS", "Parser", "add_problem", "chosen_problem", "lab", "plain_number", "show"]
+__all__ = ["COMMANDS", "Parser", "add_problem", "chosen_problem", "lab", "show", "spelled"]
 
 COMMANDS = {
     "list": ("neuralq.apps.cli.lab", "list_command", "every problem and every method, with what is known of them"),
@@ -71,8 +71,8 @@ def _parser() -> Parser:
                 "",
                 "examples:",
                 "  neuralq lab baird",
-                "  neuralq lab diagnose baird --method td --lambda_ 0.9",
-                "  neuralq lab critical baird --parameter lambda_",
+                "  neuralq lab diagnose baird --method td --lambda 0.9",
+                "  neuralq lab critical baird --parameter lambda",
                 "  neuralq lab --serve",
                 "",
                 "`neuralq lab COMMAND --help` tells a command's options. Every command takes --json.",
@@ -108,57 +108,49 @@ def list_command(argv: list[str]) -> int:
     )
     options = parser.parse_args(argv)
     from neuralq.apps.cli.fitted_choices import fitted_table, plain_choices
+    from neuralq.lab import METHODS, PROBLEMS
+    from neuralq.lab.plain import fields_of
 
+    problems = [entry.make() for entry in PROBLEMS]
     if options.json:
-        show(True, {**_plain_list(), **plain_choices()})
+        names = ("name", "title", "source", "known", "gamma", "step_size", "num_weights", "learns_q")
+        plain = [fields_of(one, *names) for one in problems]
+        show(True, {"problems": plain, "methods": [one.plain() for one in METHODS], **plain_choices()})
     else:
-        show(False, {}, *_tables(), fitted_table())
+        show(False, {}, *_tables(problems, METHODS), fitted_table())
     return 0
 
 
-def _tables() -> tuple[Table, Table]:
+def _tables(made: Sequence[Problem], known: Sequence[Method]) -> tuple[Table, Table]:
     """Problems and methods for people."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text
 
-    from neuralq.lab import METHODS, PROBLEMS
-
-    made = [entry.make() for entry in PROBLEMS]
     problems = Table("problem", "what it is", "rows", "weights", "γ", title="problems", box=SIMPLE_HEAD)
-    problems.columns[0].no_wrap = True
     for one in made:
         rows = int(one.mdp.num_rows if one.learns_q else (~one.mdp.is_terminal).sum())
         kind = f"{rows} {'pairs' if one.learns_q else 'states'}"
         title = Text.assemble(one.title, (f" ({one.source})" * bool(one.source), "dim"))
         problems.add_row(one.name, title, kind, str(one.num_weights), f"{one.gamma:g}")
     methods = Table("method", "what it is", "options", title="methods", box=SIMPLE_HEAD)
-    methods.columns[0].no_wrap = True
-    for method in METHODS:
-        settings = ", ".join(f"{name}={value:g}" for name, value in method.options.items())
+    for method in known:
+        settings = ", ".join(f"{spelled(name)}={value:g}" for name, value in method.defaults.items())
         on = "; learns pairs" if method.rows == "pairs" else ""
         methods.add_row(method.name, Text.assemble(method.title, (f" ({method.source}{on})", "dim")), settings)
-    problems.title_justify = methods.title_justify = "left"
+    for table in (problems, methods):
+        table.title_justify, table.columns[0].no_wrap = "left", True
     return problems, methods
 
 
-def _plain_list() -> dict[str, Any]:
-    """Problems and methods for programs."""
-    from neuralq.lab import METHODS, PROBLEMS
+def spelled(name: str) -> str:
+    """The name of an option as it is typed.
 
-    made = [entry.make() for entry in PROBLEMS]
-    return {
-        "problems": [
-            {"name": one.name, "title": one.title, "source": one.source, "known": one.known, "gamma": one.gamma,
-             "step_size": one.step_size, "num_weights": one.num_weights, "learns_q": one.learns_q}
-            for one in made
-        ],
-        "methods": [
-            {"name": one.name, "title": one.title, "source": one.source, "options": dict(one.options),
-             "rows": one.rows, "note": one.note}
-            for one in METHODS
-        ],
-    }  # fmt: skip
+    Example:
+        >>> spelled("lambda_"), spelled("beta_over_alpha")
+        ('lambda', 'beta-over-alpha')
+    """
+    return option_as_typed(f"--{name}").removeprefix("--")
 
 
 def show(as_json: bool, plain: dict[str, Any], *parts: RenderableType) -> None:
@@ -173,11 +165,6 @@ def show(as_json: bool, plain: dict[str, Any], *parts: RenderableType) -> None:
         console.print(part)
 
 
-def plain_number(value: float | None) -> float | None:
-    """JSON knows no infinity: what is unlimited, or not known, is null."""
-    return None if value is None or value in (float("inf"), float("-inf")) or value != value else float(value)
-
-
 def add_problem(parser: Parser, *, step_size: str) -> None:
     """The arguments that say which problem is meant."""
     parser.add_argument("problem", metavar="PROBLEM", help="a name from `neuralq lab list`, such as baird")
@@ -190,24 +177,10 @@ def chosen_problem(options: argparse.Namespace) -> Problem:
     from dataclasses import replace
 
     from neuralq.lab import problem
+    from neuralq.lab.linear.process import check_values
 
     made = problem(options.problem)
     if options.gamma is not None:
         made = replace(made, gamma=options.gamma)
-    if made.gamma == 1:
-        _check_values(made)
+    check_values(made)
     return made
-
-
-def _check_values(made: Problem) -> None:
-    """With γ = 1 there are values only where every path ends."""
-    import numpy as np
-
-    from neuralq.lab.linear.process import linear_process
-
-    try:
-        finite = bool(np.isfinite(linear_process(made).v).all())
-    except (RuntimeError, ValueError):
-        finite = False
-    if not finite:
-        raise Failure(f"{made.name} never ends, so it has no values with γ = 1; choose a --gamma below 1")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -15,12 +14,13 @@ from rich.table import Table
 from rich.text import Text
 
 from neuralq.apps.cli import Failure, command_parser
-from neuralq.apps.cli.lab import Parser, add_problem, chosen_problem, plain_number, show
-from neuralq.lab import CRITICAL_PARAMETERS, METHODS, Diagnosis, NoBoundary, Remedy, Run, StabilityScan, scan
+from neuralq.apps.cli.lab import Parser, add_problem, chosen_problem, show, spelled
+from neuralq.lab import CRITICAL_PARAMETERS, METHODS, Diagnosis, NoBoundary, Remedy, StabilityScan, Trial, scan
 from neuralq.lab import diagnose as diagnosis_of
 from neuralq.lab import prescribe as remedies_of
 from neuralq.lab import run as run_of
 from neuralq.lab.comparison import NEUTRAL_BAND, outcome_of
+from neuralq.lab.verdicts.remedies import usual_method
 
 __all__ = ["COLOURS", "critical", "diagnose", "prescribe", "run"]
 
@@ -49,22 +49,19 @@ def _with_method(parser: Parser, argv: list[str]) -> tuple[argparse.Namespace, d
     """The arguments, among them the options of the method that they name."""
     parser.add_argument(
         "--method", default="td", choices=[one.name for one in METHODS], metavar="METHOD",
-        help="a name from `neuralq lab list` (default: td); its options follow by name, as in --lambda_ 0.9",
+        help="a name from `neuralq lab list` (default: td); its options follow by name, as in --lambda 0.9",
     )  # fmt: skip
     early = Parser(add_help=False, allow_abbrev=False)
     early.add_argument("--method", default="td")
     name = early.parse_known_args(argv)[0].method
     own = next((one.options for one in METHODS if one.name == name), {})
     group = parser.add_argument_group(f"options of {name}")
-    for option, value in own.items():
-        group.add_argument(_flag(option), dest=f"method_{option}", type=float, metavar="X", help=f"default: {value:g}")
+    for option, kind in own.items():
+        text = f"{kind.label}: {kind.range_text} (default: {kind.default:g})"
+        group.add_argument(f"--{spelled(option)}", dest=f"method_{option}", type=float, metavar="X", help=text)
     options = parser.parse_args(argv)
     given = {option: getattr(options, f"method_{option}") for option in own}
     return options, {option: value for option, value in given.items() if value is not None}
-
-
-def _flag(option: str) -> str:
-    return "--lambda_" if option == "lambda_" else "--" + option.replace("_", "-")
 
 
 def diagnose(argv: list[str]) -> int:
@@ -73,7 +70,7 @@ def diagnose(argv: list[str]) -> int:
         "lab diagnose",
         "What a method will do on a problem, before it is trained: verdict, growth, step-size bounds, fixed point.",
         "neuralq lab diagnose baird",
-        "neuralq lab diagnose baird --method td --lambda_ 0.95 --sampling markov",
+        "neuralq lab diagnose baird --method td --lambda 0.95 --sampling markov",
         "neuralq lab diagnose kolter --method polyak-target --tau 0.01 --step-size 0.05",
     )
     add_problem(parser, step_size="the problem's own")
@@ -82,7 +79,7 @@ def diagnose(argv: list[str]) -> int:
     problem = chosen_problem(options)
     with Console(file=sys.stderr).status("looking for eigenvalues and bounds"):
         found = diagnosis_of(problem, options.method, options.step_size, options.sampling, **given)
-    show(options.json, _plain_diagnosis(found), _headline(found), found.explain(), _numbers(found))
+    show(options.json, found.plain(), _headline(found), found.explain(), _numbers(found))
     return 0
 
 
@@ -101,8 +98,8 @@ def _numbers(found: Diagnosis) -> Table:
         "step sizes below": _bound(found.step_size_bound),
         "with variance": _bound(found.step_size_bound_second_moment),
         "doubles in": "" if found.doubling_time is None else f"{found.doubling_time:.4g} updates",
-        "error of fixed point": _error(found.fixed_point_error, found.scale),
-        "least error": _error(found.best_error, found.scale),
+        "error of fixed point": _error(found.rounded(found.fixed_point_error)),
+        "least error": _error(found.rounded(found.best_error)),
     }
     for name, text in rows.items():
         if text not in ("", "?"):
@@ -124,85 +121,41 @@ def _number(value: float | None) -> str:
     return "" if value is None else "any" if value == float("inf") else f"{value:.7g}"
 
 
-def _plain_diagnosis(found: Diagnosis) -> dict[str, Any]:
-    return {
-        "problem": found.problem,
-        "method": found.method,
-        "options": dict(found.options),
-        "sampling": found.sampling,
-        "verdict": found.verdict,
-        "converges": found.converges,
-        **{
-            name: plain_number(getattr(found, name))
-            for name in (
-                *("step_size", "spectral_radius", "second_moment_radius", "step_size_bound"),
-                *("step_size_bound_second_moment", "doubling_time", "fixed_point_error", "best_error"),
-                *("distance_to_singularity", "drift"),
-            )
-        },
-        "oscillates": found.oscillates,
-        "rank": found.rank,
-        "updates": found.updates,
-        "local": found.local,
-        "eigenvalues": [[float(value.real), float(value.imag)] for value in found.eigenvalues],
-        "fixed_point": None if found.fixed_point is None else found.fixed_point.tolist(),
-        "explanation": found.explain(),
-    }
-
-
 def critical(argv: list[str]) -> int:
     """Find where stability changes in one parameter."""
+    parameters = {spelled(name): name for name in CRITICAL_PARAMETERS}
     parser = command_parser(
         "lab critical",
         "The values of a parameter at which stability changes, from a scan of its whole range.",
-        "neuralq lab critical baird --parameter lambda_",
+        "neuralq lab critical baird --parameter lambda",
         "neuralq lab critical baird --parameter period --step-size 0.01",
     )
     add_problem(parser, step_size="the limit of small steps, where the method has one")
     parser.add_argument(
-        "--parameter", required=True, choices=list(CRITICAL_PARAMETERS), metavar="P",
-        help=f"one of {', '.join(CRITICAL_PARAMETERS)}",
+        "--parameter", required=True, type=spelled, choices=list(parameters), metavar="P",
+        help=f"one of {', '.join(parameters)}",
     )  # fmt: skip
     options, given = _with_method(parser, argv)
     problem = chosen_problem(options)
     with Console(file=sys.stderr).status(f"scanning {options.parameter}"):
-        found = scan(problem, options.parameter, options.method, options.step_size, None, **given)
-    plain = {
-        "problem": found.problem, "method": found.method, "parameter": found.parameter, "step_size": found.step_size,
-        "critical": found.boundaries[0] if found.boundaries else None, "boundaries": list(found.boundaries),
-        "stable": [list(interval) for interval in found.stable], "range": [found.values[0], found.values[-1]],
-    }  # fmt: skip
-    show(options.json, plain, *_boundary_lines(found))
-    if not found.boundaries:
-        raise Failure(str(_nothing_changes(found)))
+        found = scan(problem, parameters[options.parameter], options.method, options.step_size, None, **given)
+    show(options.json, found.plain(), *_boundary_lines(found))
+    try:
+        found.first()
+    except NoBoundary as nothing_changes:
+        raise Failure(str(nothing_changes)) from nothing_changes
     return 0
 
 
-def _boundary_lines(found: StabilityScan) -> list[Text]:
-    how = "in the limit of small steps" if found.step_size is None else f"with α = {found.step_size:g}"
+def _boundary_lines(found: StabilityScan) -> Iterator[Text]:
     if not found.boundaries:
-        return []
-    lines = [
-        Text.assemble(
-            f"{found.method} on {found.problem}, {how}: stability first changes at {found.parameter} = ",
-            (f"{found.boundaries[0]:.12g}", "bold"),
-        )
-    ]
-    edges = [found.values[0], *found.boundaries, found.values[-1]]
-    stable = bool(found.margins[0] > 0)
-    for low, high in itertools.pairwise(edges):
+        return
+    how = "in the limit of small steps" if found.step_size is None else f"with α = {found.step_size:g}"
+    head = f"{found.method} on {found.problem}, {how}: stability first changes at {found.parameter} = "
+    yield Text.assemble(head, (f"{found.boundaries[0]:.12g}", "bold"))
+    for low, high, stable in found.intervals:
         word, colour = ("converges", "green") if stable else ("diverges", "red")
-        lines.append(Text.assemble("  ", (f"{word:<10}", colour), f"{low:>14.9g} … {high:.9g}"))
-        stable = not stable
-    return lines
-
-
-def _nothing_changes(found: StabilityScan) -> NoBoundary:
-    what = "stable" if found.margins[0] > 0 else "unstable"
-    return NoBoundary(
-        f"{found.method} on {found.problem} is {what} for every {found.parameter} from {found.values[0]:g} to "
-        f"{found.values[-1]:g}: there is no critical value"
-    )
+        yield Text.assemble("  ", (f"{word:<10}", colour), f"{low:>14.9g} … {high:.9g}")
 
 
 def prescribe(argv: list[str]) -> int:
@@ -219,11 +172,10 @@ def prescribe(argv: list[str]) -> int:
     problem = chosen_problem(options)
     with Console(file=sys.stderr).status("trying every kind of remedy (some seconds)"):
         remedies = remedies_of(problem, options.step_size)
-    base = ("sarsa" if problem.exploration is not None else "q-learning") if problem.control else "td"
-    trouble = diagnosis_of(problem, base, options.step_size)
+    trouble = diagnosis_of(problem, usual_method(problem), options.step_size)
     plain = {
         "problem": problem.name, "verdict": trouble.verdict, "converges": trouble.converges,
-        "explanation": trouble.explain(), "remedies": [_plain_remedy(one) for one in remedies],
+        "explanation": trouble.explain(), "remedies": [one.plain() for one in remedies],
     }  # fmt: skip
     parts: list[Any] = [_headline(trouble), trouble.explain()]
     if trouble.converges:
@@ -249,25 +201,13 @@ def _remedies(remedies: list[Remedy]) -> Table:
         runs = Text("scatter", "magenta") if one.scatters else "settle" if one.second_moment_radius is not None else "?"
         table.add_row(
             str(i), one.change, f"{updates:,.0f}" if updates < 1e6 else f"{updates:.2g}",
-            _error(found.fixed_point_error, found.scale), _error(found.best_error, found.scale), runs,
+            _error(found.rounded(found.fixed_point_error)), _error(found.rounded(found.best_error)), runs,
         )  # fmt: skip
     return table
 
 
-def _error(value: float | None, scale: float | None) -> str:
-    return "?" if value is None else "0" if value < 1e-9 * max(scale or 0.0, 1.0) else f"{value:.3g}"
-
-
-def _plain_remedy(one: Remedy) -> dict[str, Any]:
-    return {
-        "kind": one.kind, "change": one.change, "method": one.method, "options": dict(one.options),
-        "step_size": one.step_size, "critical": plain_number(one.critical),
-        "spectral_radius": one.diagnosis.spectral_radius, "updates_to_tenth": plain_number(one.updates_to_tenth),
-        "fixed_point_error": plain_number(one.diagnosis.fixed_point_error),
-        "best_error": plain_number(one.diagnosis.best_error),
-        "second_moment_radius": plain_number(one.second_moment_radius), "scatters": one.scatters,
-        "explanation": one.explain(),
-    }  # fmt: skip
+def _error(value: float | None) -> str:
+    return "?" if value is None else f"{value:.3g}"
 
 
 def run(argv: list[str]) -> int:
@@ -295,14 +235,19 @@ def run(argv: list[str]) -> int:
             problem, options.method, options.num_steps, options.step_size, options.sampling, seeds, options.seed, given
         )
         found = diagnosis_of(problem, options.method, options.step_size, "expected", **given)
-    plain = _plain_run(record, found)
+    outcome, certain = outcome_of(record), options.sampling == "expected" and found.verdict != "neutral"
+    wrong = certain and abs(found.spectral_radius - 1) > NEUTRAL_BAND and outcome == "grows" and found.converges
+    plain = {
+        **record.plain(), "outcome": outcome, "predicted": found.verdict, "spectral_radius": found.spectral_radius,
+        "contradiction": wrong,
+    }  # fmt: skip
     show(options.json, plain, _curve(record), *_outcome_lines(record, found))
-    if plain["contradiction"]:
-        raise Failure(f"the run {plain['outcome']}, but the prediction is that it {found.verdict}: please report this")
+    if wrong:
+        raise Failure(f"the run {outcome}, but the prediction is that it {found.verdict}: please report this")
     return 0
 
 
-def _curve(record: Run) -> Table:
+def _curve(record: Trial) -> Table:
     one = record.rmsve.shape[1] == 1
     table = Table("update", "RMSVE", *([] if one else ["10% … 90%"]), "RMSPBE", *([] if one else ["diverged"]))
     for column in table.columns:
@@ -322,7 +267,7 @@ def _curve(record: Run) -> Table:
     return table
 
 
-def _outcome_lines(record: Run, found: Diagnosis) -> list[Text]:
+def _outcome_lines(record: Trial, found: Diagnosis) -> list[Text]:
     outcome, num_seeds = outcome_of(record), len(record.stopped_at)
     left = int(record.diverged.sum())
     measured = Text.assemble("measured   ", (outcome, COLOURS[outcome]), f", ×{record.growth:.7g} per update")
@@ -333,25 +278,3 @@ def _outcome_lines(record: Run, found: Diagnosis) -> list[Text]:
         "predicted  ", (found.verdict, COLOURS[found.verdict]), f", ×{found.spectral_radius:.7g}{per} in the mean"
     )
     return [measured, predicted]
-
-
-def _plain_run(record: Run, found: Diagnosis) -> dict[str, Any]:
-    outcome = outcome_of(record)
-    certain = (
-        found.verdict != "neutral"
-        and abs(found.spectral_radius - 1) > NEUTRAL_BAND
-        and found.sampling == record.sampling
-    )
-    return {
-        "problem": record.problem, "method": record.method, "options": dict(_floats(record.options)),
-        "sampling": record.sampling, "step_size": record.step_size, "num_steps": int(record.steps[-1]),
-        "num_seeds": len(record.stopped_at), "num_diverged": int(record.diverged.sum()), "growth": record.growth,
-        "outcome": outcome, "predicted": found.verdict, "spectral_radius": found.spectral_radius,
-        "contradiction": certain and outcome == "grows" and found.converges,
-        "steps": record.steps.tolist(), "rmsve": record.quantiles().tolist(),
-        "rmspbe": record.quantiles(of="rmspbe").tolist(), "weights": record.weights[:1].tolist(),
-    }  # fmt: skip
-
-
-def _floats(options: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(value) for name, value in options.items()}

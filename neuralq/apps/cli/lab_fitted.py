@@ -38,7 +38,6 @@ _COLOURS = {
 _SUPPORTS = {"grid": "grid points", "no-goal": "grid points without goal", "random": "random points"}
 _STARTS = ("zero", "tilted", "exact")
 _TILT = 1e-3  # of the first coordinate against the last, which breaks every symmetry between them
-_ROWS = 11  # of a run's table
 _MOST_REACHABLE = 20_000  # states of a finite model that is worth solving for a reference
 _RUN = 1000  # sweeps by default
 _SHORT_RUN = 100  # with a network, which is trained anew in each
@@ -56,12 +55,11 @@ class _Setting:
 
 @dataclass(frozen=True)
 class _Case:
-    """What was found of one regressor on one world; the error is [k + 1], or None without exact costs."""
+    """What was found of one regressor on one world."""
 
     world: str
     regressor: str
     found: FittedDiagnosis
-    error: Floats | None
 
 
 def fitted(argv: list[str]) -> int:
@@ -210,10 +208,10 @@ def _case(setting: _Setting, one: FittedChoice, options: argparse.Namespace) -> 
     regressor = _regressor(setting, one, options)
     sweeps = options.iterations or (_SHORT_RUN if one.name == "network" else _RUN)
     found = diagnose_fitted(
-        setting.model, setting.support, regressor, gamma=options.gamma, num_iterations=sweeps, start=setting.start
-    )
-    error = None if setting.exact is None else np.abs(found.run.values - setting.exact).max(axis=1)
-    return _Case(setting.model.name, one.name, found, error)
+        setting.model, setting.support, regressor, gamma=options.gamma, num_iterations=sweeps, start=setting.start,
+        exact=setting.exact,
+    )  # fmt: skip
+    return _Case(setting.model.name, one.name, found)
 
 
 def _regressor(setting: _Setting, one: FittedChoice, options: argparse.Namespace) -> Regressor:
@@ -232,9 +230,8 @@ def _grown(
     _, reached = greedy_costs(setting.model, grown.fitted, grown.costs, setting.support)
     excess = None if setting.exact is None else float((grown.costs - setting.exact[grown.index]).max())
     plain = {
-        "complete": grown.complete, "settled": grown.settled, "history": list(grown.history),
-        "num_points": len(grown.costs), "num_candidates": len(setting.support), "max_cost": float(grown.costs.max()),
-        "max_excess": excess, "num_reached": int(reached.sum()), "tolerance": options.tolerance,
+        **grown.plain(), "num_candidates": len(setting.support), "max_excess": excess,
+        "num_reached": int(reached.sum()), "tolerance": options.tolerance,
     }  # fmt: skip
     return plain, list(_grown_lines(grown, excess, int(reached.sum()), len(setting.support)))
 
@@ -292,19 +289,15 @@ def _reasons(found: FittedDiagnosis) -> Table:
 def _curve(case: _Case) -> Table:
     """Max |V| and the error after a few sweeps, evenly spread."""
     run = case.found.run
-    table = Table("sweep", "max |V|", "changes of policy", *([] if case.error is None else ["max error"]),
+    table = Table("sweep", "max |V|", "changes of policy", *([] if run.error is None else ["max error"]),
                   box=SIMPLE_HEAD)  # fmt: skip
     for column in table.columns:
         column.justify = "right"
     largest, changes = run.max_abs, np.concatenate([[0], np.cumsum(run.policy_changes)])
-    for k in _shown(run.iterations):
-        error = [] if case.error is None else [f"{case.error[k]:.5g}"]
+    for k in run.shown:
+        error = [] if run.error is None else [f"{run.error[k]:.5g}"]
         table.add_row(f"{k:,}", f"{largest[k]:.7g}", f"{changes[k]:,}", *error)
     return table
-
-
-def _shown(last: int) -> list[int]:
-    return sorted({round(last * i / (_ROWS - 1)) for i in range(_ROWS)})
 
 
 def _tables(cases: Sequence[_Case], options: argparse.Namespace) -> Iterator[RenderableType]:
@@ -335,7 +328,7 @@ def _line(case: _Case) -> list[str | Text]:
         "" if found.growth is None else f"{found.growth:.4f}",
         f"{outcome} {run.iterations}",
         f"{run.max_abs[-1]:.4g}",
-        "" if case.error is None else f"{case.error[-1]:.3g}",
+        "" if run.error is None else f"{run.error[-1]:.3g}",
     ]
 
 
@@ -344,15 +337,4 @@ def _pairs() -> Table:
 
 
 def _plain(case: _Case) -> dict[str, Any]:
-    found, run = case.found, case.found.run
-    shown = _shown(run.iterations)
-    return {
-        "world": case.world, "regressor": case.regressor, "verdict": found.verdict, "certain": found.guaranteed,
-        "averager": found.averager, "hat_norm": found.hat_norm, "contraction": found.contraction,
-        "growth": found.growth, "ray_growth": found.ray_growth, "gamma": found.gamma,
-        "num_points": run.values.shape[1], "sweeps": run.iterations, "converged": run.converged,
-        "stopped_on_cap": run.stopped_on_cap, "run_growth": run.growth,
-        "max_abs": [[k, float(run.max_abs[k])] for k in shown],
-        "error": None if case.error is None else [[k, float(case.error[k])] for k in shown],
-        "explanation": found.explain(),
-    }  # fmt: skip
+    return {"world": case.world, "regressor": case.regressor, **case.found.plain()}

@@ -59,9 +59,9 @@ def matrix(argv: list[str]) -> int:
     options.jobs = (1 if few else os.cpu_count() or 1) if options.jobs is None else options.jobs
     for name in ("seeds", "num_steps", "jobs"):
         check_whole(f"--{name.replace('_', '-')}", getattr(options, name))
-    sampled = (options.sampling, options.seeds, options.num_steps, options.seed)
+    sampled = {name: getattr(options, name) for name in ("sampling", "num_steps", "seed")}
     with _progress(len(problems) * len(methods)) as tick:
-        found = _in_parallel(problems, methods, sampled, options.jobs, tick)
+        found = _in_parallel(problems, methods, options.jobs, tick, num_seeds=options.seeds, **sampled)
     if options.csv is not None:
         found.write_csv(options.csv)
     parts: list[RenderableType] = list(_lines(found.cells)) if options.list or few else list(_grids(found))
@@ -110,27 +110,17 @@ def _names(given: list[str] | None, every: list[str], lookup: Callable[[str], ob
     return every if given is None else [name for name in every if name in given]
 
 
-def _in_parallel(
-    problems: list[str], methods: list[str], sampled: tuple[Any, int, int, int], jobs: int, tick: Tick
-) -> Matrix:
+def _in_parallel(problems: list[str], methods: list[str], jobs: int, tick: Tick, **sampled: Any) -> Matrix:
     """The matrix, its rows spread over processes."""
-    sampling, seeds, steps, seed = sampled
     if jobs == 1 or len(problems) == 1:
-        return matrix_of(
-            problems, methods, tick, sampling=sampling, num_seeds=seeds, num_steps=steps, seed=seed
-        )  # fmt: skip
+        return matrix_of(problems, methods, tick, **sampled)
     rows = []
     with ProcessPoolExecutor(min(jobs, len(problems)), mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(_row, name, methods, sampled) for name in problems]
+        waiting = [pool.submit(matrix_of, [name], methods, **sampled) for name in problems]
         for i, one in enumerate(waiting):
             rows.append(one.result())
             tick(problems[i], "", (i + 1) * len(methods), len(problems) * len(methods))
     return Matrix(tuple(problems), tuple(methods), tuple(chain.from_iterable(row.cells for row in rows)))
-
-
-def _row(name: str, methods: list[str], sampled: tuple[Any, int, int, int]) -> Matrix:
-    sampling, seeds, steps, seed = sampled
-    return matrix_of([name], methods, sampling=sampling, num_seeds=seeds, num_steps=steps, seed=seed)
 
 
 @contextmanager
@@ -256,24 +246,16 @@ def baird(argv: list[str]) -> int:
         "neuralq lab baird",
         "neuralq lab baird --gamma 0.85",
     )
-    parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99; the threshold is 15/17)")
-    parser.add_argument("--step-size", type=float, default=0.01, help="α (default: 0.01)")
-    parser.add_argument("--num-upper", type=int, default=6, help="upper states of the star (default: 6)")
-    parser.add_argument("--num-steps", type=int, default=5000, help="sweeps of each representation (default: 5000)")
+    from neuralq.apps.cli.demo import add_star, show_star, star_console, star_of
+
+    add_star(parser)
     options = parser.parse_args(argv)
-    from dataclasses import replace
-
-    from neuralq.apps.cli.demo import plain_star, show_star
-    from neuralq.lab.problems import star
-
-    # Prediction and measurement go where tables go; with --json they are progress.
-    console = Console(file=sys.stderr if options.json else sys.stdout)
-    predictions, results = show_star(console, options.num_steps, options.gamma, options.step_size, options.num_upper)
-    one = replace(star(options.num_upper), gamma=options.gamma, step_size=options.step_size)
+    one = star_of(options)
+    results = show_star(star_console(options), one, options.num_steps, options.seed)
     methods = [name.name for name in METHODS if name.rows != "pairs"]
     with _progress(len(methods)) as tick:
         found = matrix_of([one], methods, tick)
-    plain = {"baird": plain_star(predictions, results), **found.plain()}
+    plain = {"baird": [result.plain() for result in results], **found.plain()}
     show(options.json, plain, "", Text("what every method makes of the linear features", "bold"), *_lines(found.cells),
          *_findings(found))  # fmt: skip
     return _status(found)

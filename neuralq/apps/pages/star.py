@@ -22,7 +22,7 @@ from neuralq.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from neuralq.lab import BairdResult
+    from neuralq.lab import RepresentationResult
 
 __all__ = ["divergence_svg", "growth_table", "values_table", "write_demo_report"]
 
@@ -31,7 +31,7 @@ def write_demo_report(
     path: str | Path,
     training_rows: Sequence[Row],
     training_facts: Mapping[str, Any],
-    baird_results: Sequence[BairdResult],
+    baird_results: Sequence[RepresentationResult],
     *,
     target: float | None = None,
 ) -> Path:
@@ -75,7 +75,7 @@ def _add_training(page: Page, rows: Sequence[Row], facts: Mapping[str, Any], tar
     page.table(facts_table({key.replace("_", " "): value for key, value in facts.items()}))
 
 
-def _add_star(page: Page, results: Sequence[BairdResult]) -> None:
+def _add_star(page: Page, results: Sequence[RepresentationResult]) -> None:
     page.heading("2. The same update, five representations")
     page.paragraph(
         "Baird's star has no reward at all, so the exact value of every state is 0 and any other number is an error. "
@@ -99,7 +99,7 @@ def _add_star(page: Page, results: Sequence[BairdResult]) -> None:
     page.table(values_table(results))
 
 
-def divergence_svg(results: Sequence[BairdResult], *, name: str = "divergence") -> str:
+def divergence_svg(results: Sequence[RepresentationResult], *, name: str = "divergence") -> str:
     """The error of each representation against sweeps on a logarithmic axis; dashed: the growth predicted beforehand.
 
     A prediction starts at the first measured error e₀ and follows e₀·gⁿ.
@@ -148,12 +148,12 @@ def _positive(errors: Array) -> Array:
     return np.where(array > 1e-150, array, np.nan)
 
 
-def _sweeps(result: BairdResult) -> Array:
+def _sweeps(result: RepresentationResult) -> Array:
     steps = np.asarray(result.steps, np.float64)
     return steps if steps.ndim else np.arange(len(result.rmsve), dtype=np.float64)
 
 
-def _predicted(result: BairdResult) -> Array:
+def _predicted(result: RepresentationResult) -> Array:
     steps, errors = _sweeps(result), _positive(result.rmsve)
     growth = float(result.predicted_growth)
     if not len(errors) or not math.isfinite(errors[0]) or not (math.isfinite(growth) and growth > 0):
@@ -162,7 +162,7 @@ def _predicted(result: BairdResult) -> Array:
     return np.where(np.abs(exponent) < 150, 10.0 ** np.clip(exponent, -150, 150), np.nan)
 
 
-def growth_table(results: Sequence[BairdResult]) -> str:
+def growth_table(results: Sequence[RepresentationResult]) -> str:
     """An HTML table: what was predicted for each representation before the first update, and what was measured."""
     header = ["representation", "predicted growth", "prediction holds", "verdict", "measured growth", "last error"]
     scopes = {"global": "everywhere", "local": "near the start"}
@@ -180,7 +180,7 @@ def growth_table(results: Sequence[BairdResult]) -> str:
     return html_table("Growth of the error per sweep: below 1 it dies out, above 1 it multiplies", header, body)
 
 
-def values_table(results: Sequence[BairdResult]) -> str:
+def values_table(results: Sequence[RepresentationResult]) -> str:
     """An HTML table: the exact value of every state beside what each representation learned."""
     if not results:
         return html_table("Exact and learned values", ["state", "exact"], [])

@@ -7,17 +7,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from neuralq.apps.web.catalogue import problem_named
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import method
+from neuralq.lab.plain import plain
 from neuralq.lab.problems import Problem
 from neuralq.lab.trial import run
 from neuralq.lab.verdicts.critical import StabilityScan, scan
-from neuralq.lab.verdicts.diagnosis import Diagnosis, diagnose
+from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.remedies import Remedy, prescribe
-from neuralq.types import Floats
 
 __all__ = ["answer"]
 
@@ -29,6 +27,8 @@ MOST_WEIGHTS = 12
 
 MOST_EIGENVALUES = 400
 """Eigenvalues drawn; of more, the largest."""
+
+_UNSAID = ("problem", "method", "options", "sampling", "step_size", "drift")  # the page knows them, or has no use
 
 
 def answer(kind: str, spec: Spec) -> Json:
@@ -47,30 +47,12 @@ def answer(kind: str, spec: Spec) -> Json:
 
 
 def _diagnose(where: Problem, spec: Spec) -> Json:
-    return _diagnosis(diagnose(where, spec["method"], None, spec["sampling"], **spec["options"]))
-
-
-def _diagnosis(found: Diagnosis) -> Json:
-    small = 1e-9 * max(found.scale or 0.0, 1.0)  # less than this is rounding
-    factors = found.eigenvalues[np.isfinite(found.eigenvalues)][:MOST_EIGENVALUES]
-    return {
-        "verdict": found.verdict,
-        "converges": found.converges,
-        "explanation": found.explain(),
-        "eigenvalues": [[float(one.real), float(one.imag)] for one in factors],
-        "rank": found.rank,
-        "spectral_radius": _finite(found.spectral_radius),
-        "second_moment_radius": _finite(found.second_moment_radius),
-        "step_size_bound": _bound(found.step_size_bound),
-        "step_size_bound_second_moment": _bound(found.step_size_bound_second_moment),
-        "oscillates": found.oscillates,
-        "doubling_time": _finite(found.doubling_time),
-        "fixed_point": None if found.fixed_point is None else _row(found.fixed_point),
-        "fixed_point_error": _error(found.fixed_point_error, small),
-        "best_error": _error(found.best_error, small),
-        "distance_to_singularity": _finite(found.distance_to_singularity),
-        "updates": found.updates,
-        "local": found.local,
+    found = diagnose(where, spec["method"], None, spec["sampling"], **spec["options"])
+    shown = {name: one for name, one in found.plain().items() if name not in _UNSAID}
+    return shown | {
+        "eigenvalues": shown["eigenvalues"][:MOST_EIGENVALUES],
+        **{name: _bound(getattr(found, name)) for name in ("step_size_bound", "step_size_bound_second_moment")},
+        **{name: plain(found.rounded(getattr(found, name))) for name in ("fixed_point_error", "best_error")},
     }
 
 
@@ -80,17 +62,14 @@ def _run(where: Problem, spec: Spec) -> Json:
     went = run(
         where, spec["method"], spec["num_steps"], None, spec["sampling"], spec["num_seeds"], 0, spec["options"]
     )  # fmt: skip
-    shown = went.path[:, :MOST_WEIGHTS]
-    growth = went.growth
-    return {
-        "steps": [int(step) for step in went.steps],
-        "rmsve": [_row(column) for column in went.quantiles().T],
-        "rmspbe": _row(went.quantiles([0.5], of="rmspbe")[:, 0]),
-        "weights": [_row(column) for column in shown.T],
+    shown = {
+        name: one for name, one in went.plain().items() if name in ("steps", "num_seeds", "num_diverged", "growth")
+    }
+    return shown | {
+        "rmsve": plain(went.quantiles().T),
+        "rmspbe": plain(went.quantiles([0.5], of="rmspbe")[:, 0]),
+        "weights": plain(went.path[:, :MOST_WEIGHTS].T),
         "num_weights": where.num_weights,
-        "num_seeds": went.rmsve.shape[1],
-        "num_diverged": int(went.diverged.sum()),
-        "growth": _finite(growth),
     }
 
 
@@ -114,11 +93,7 @@ def _critical(where: Problem, spec: Spec) -> Json:
 
 
 def _stable(found: StabilityScan) -> Json:
-    return {
-        "range": [float(found.values[0]), float(found.values[-1])],
-        "boundaries": [float(value) for value in found.boundaries],
-        "stable": [list(interval) for interval in found.stable],
-    }
+    return {name: one for name, one in found.plain().items() if name in ("range", "boundaries", "stable")}
 
 
 def _prescribe(where: Problem, spec: Spec) -> Json:
@@ -126,15 +101,11 @@ def _prescribe(where: Problem, spec: Spec) -> Json:
 
 
 def _remedy(remedy: Remedy) -> Json:
-    return {
-        "kind": remedy.kind,
+    kept = ("kind", "options", "step_size", "scatters", "spectral_radius")
+    return {name: one for name, one in remedy.plain().items() if name in kept} | {
         "text": remedy.explain(),
         "method": None if remedy.kind == "distribution" else remedy.method,
-        "options": dict(remedy.options),
-        "step_size": remedy.step_size,
-        "scatters": remedy.scatters,
         "verdict": remedy.diagnosis.verdict,
-        "spectral_radius": _finite(remedy.diagnosis.spectral_radius),
     }
 
 
@@ -146,18 +117,6 @@ _ANSWERS: dict[str, Callable[[Problem, Spec], Json]] = {
 }
 
 
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def _error(value: float | None, small: float) -> float | None:
-    return 0.0 if value is not None and value < small else _finite(value)
-
-
 def _bound(value: float | None) -> Json:
     """A bound that may be infinite: then every step size will do."""
-    return {"value": _finite(value), "every": value is not None and math.isinf(value)}
-
-
-def _row(values: Floats) -> list[float | None]:
-    return [_finite(float(value)) for value in values]
+    return {"value": plain(value), "every": value is not None and math.isinf(value)}

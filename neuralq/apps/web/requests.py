@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from neuralq.apps.web.catalogue import FIELDS, SAMPLINGS, critical_parameters, field_of
-from neuralq.lab.methods import METHODS, Method, method
+from neuralq.lab.methods import METHODS, Method, Option, method
 from neuralq.lab.problems import PROBLEMS
 
 __all__ = ["ANSWERS", "read_request"]
@@ -80,26 +80,24 @@ def _setting(given: Mapping[str, Any], more: Collection[str]) -> Spec:
     spec["options"] = _options(chosen, given.get("options", {}))
     for name in more:
         if name in FIELDS:
-            spec[name] = int(_number(given, name, FIELDS[name].accepts, FIELDS[name].range_text))
+            spec[name] = int(_number(given, name, FIELDS[name]))
     return spec
 
 
 def _place(given: Mapping[str, Any]) -> Spec:
     spec: Spec = {"problem": _choice(given, "problem", [entry.name for entry in PROBLEMS])}
     for name in ("gamma", "step_size"):
-        spec[name] = _number(given, name, FIELDS[name].accepts, FIELDS[name].range_text)
+        spec[name] = _number(given, name, FIELDS[name])
     return spec
 
 
 def _options(chosen: Method, given: Any) -> dict[str, float]:
     if not isinstance(given, dict):
         raise ValueError(f"options must be an object, got {type(given).__name__}")
-    chosen.checked({_short(name): 0.0 for name in given})  # refuses names that it does not have
-    found = dict(chosen.options)
     for name in given:
-        field = field_of(chosen, name)
-        found[name] = _number(given, name, field.accepts, field.range_text)
-    return found
+        if name not in chosen.options:
+            chosen.checked({_short(name): 0.0})  # refuses it
+    return {**chosen.defaults, **{name: _number(given, name, field_of(chosen, name)) for name in given}}
 
 
 def _known(given: Mapping[str, Any], names: Collection[str]) -> None:
@@ -115,16 +113,16 @@ def _choice(given: Mapping[str, Any], name: str, choices: Collection[str]) -> st
     return value
 
 
-def _number(given: Mapping[str, Any], name: str, accepts: Callable[[float], bool], text: str) -> float:
+def _number(given: Mapping[str, Any], name: str, field: Option) -> float:
     value = given.get(name)
-    wrong = f"{name} must be {text}, got {_shown(value)}"
+    wrong = f"{name} must be {field.range_text}, got {_shown(value)}"
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(wrong)
     try:
         number = float(value)
     except OverflowError:  # an integer of hundreds of digits
         raise ValueError(wrong) from None
-    if not (math.isfinite(number) and accepts(number)):
+    if not (math.isfinite(number) and field.accepts(number)):
         raise ValueError(wrong)
     return number
 

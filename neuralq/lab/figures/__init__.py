@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from neuralq.lab.figures.cures import figure_critical_curves, figure_representations
-from neuralq.lab.figures.drawing import Curve, Drawing, Panel, png_of, svg_of
+from neuralq.lab.figures.drawing import Drawing, Panel, Series, png_of, svg_of
 from neuralq.lab.figures.fitted_grid import figure_fitted
 from neuralq.lab.figures.hall import figure_hall
 from neuralq.lab.figures.spiral import figure_spiral
 from neuralq.lab.figures.star import figure_11_2, figure_11_5, figure_11_6
 from neuralq.lab.figures.states import figure_chattering, figure_kolter
 
-__all__ = ["FIGURES", "Curve", "Drawing", "Panel", "png_of", "svg_of"]
+__all__ = ["FIGURES", "Drawing", "Panel", "Series", "png_of", "svg_of"]
 
 FIGURES: dict[str, Callable[[], Drawing]] = {
     "sb-11-2": figure_11_2,

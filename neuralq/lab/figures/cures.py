@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from neuralq.checks import check_discount
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.trial import run
 from neuralq.lab.verdicts.critical import scan
 from neuralq.types import Floats
@@ -92,10 +92,10 @@ def figure_critical_curves(num_upper: int = 6, num_gammas: int = 9, num_steps: i
         (fell_at, fell), (grew_at, grew) = (np.concatenate([side[kind] for side in trained], axis=1) for kind in (0, 1))
         panels.append(
             Panel(title, "γ", symbol, (
-                Curve("run converges", fell_at, fell, "rings", 0),
-                Curve("run diverges", grew_at, grew, "points", 1),
-                Curve("scan", coarse, found, "points", 2),
-                Curve(f"{symbol}*(γ), closed form", fine, np.array([exact(g, num_upper) for g in fine]), "dashed",
+                Series("run converges", fell_at, fell, "rings", 0),
+                Series("run diverges", grew_at, grew, "points", 1),
+                Series("scan", coarse, found, "points", 2),
+                Series(f"{symbol}*(γ), closed form", fine, np.array([exact(g, num_upper) for g in fine]), "dashed",
                       EXACT),
             ), legend="upper left", y_limits=(-0.09 * found.max(), 1.3 * found.max())),
         )  # fmt: skip
@@ -142,21 +142,21 @@ def figure_representations(num_steps: int = 4000, after: int = 300, seed: int = 
         >>> [curve.label for curve in drawing.panels[0].curves][:3]
         ['table', 'linear', 'action-input']
     """
-    from neuralq.lab.networks.baird import run_baird  # needs PyTorch
+    from neuralq.lab.networks.representations import run_representations  # needs PyTorch
 
-    results, early = run_baird(num_steps, seed=seed), run_baird(after, seed=seed)
+    results, early = (run_representations(star(), steps, seed=seed) for steps in (num_steps, after))
     curves, predicted, values = [], [], []
     for colour, (result, short) in enumerate(zip(results, early, strict=True)):
         x = np.arange(len(result.rmsve), dtype=np.float64)
         thin = np.unique(np.linspace(0, len(x) - 1, 90).round().astype(int))
-        curves.append(Curve(result.representation, x[thin], result.rmsve[thin], colour=colour))
+        curves.append(Series(result.representation, x[thin], result.rmsve[thin], colour=colour))
         known = np.log10(result.rmsve[0]) + x * np.log10(result.predicted_growth)
         kept = thin[known[thin] < 12][::5]
         label = f"{result.representation}, predicted"
-        predicted.append(Curve(label, x[kept], 10.0 ** known[kept], "dashed", colour, listed=False))
+        predicted.append(Series(label, x[kept], 10.0 ** known[kept], "dashed", colour, listed=False))
         states = np.arange(1.0, len(short.values) + 1)
-        values.append(Curve(short.representation, states, short.values, "points", colour))
-    predicted.append(Curve("predicted", np.full(1, np.nan), np.full(1, np.nan), "dashed", EXACT))
+        values.append(Series(short.representation, states, short.values, "points", colour))
+    predicted.append(Series("predicted", np.full(1, np.nan), np.full(1, np.nan), "dashed", EXACT))
     exact = results[0].exact_values
     states = np.arange(1.0, len(exact) + 1)
     return Drawing(
@@ -172,7 +172,7 @@ def figure_representations(num_steps: int = 4000, after: int = 300, seed: int = 
             Panel("value error", "sweeps", "√VE", (*curves, *predicted), y_scale="log", y_limits=(0.01, 1e12),
                   legend="upper right", legend_columns=2),
             Panel(f"values after {after} sweeps", "state (7 is the lower one)", "V(s)",
-                  (*values, Curve("exact", states, exact, "dashed", EXACT)), y_scale="symlog", y_limits=(-8, 3e4),
+                  (*values, Series("exact", states, exact, "dashed", EXACT)), y_scale="symlog", y_limits=(-8, 3e4),
                   legend="upper left", legend_columns=2),
         ),
     )  # fmt: skip

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["EXACT", "Curve", "Drawing", "Panel", "png_of", "svg_of"]
+__all__ = ["EXACT", "Drawing", "Panel", "Series", "png_of", "svg_of"]
 
 EXACT = 6
 """The colour (black) of an exact line that belongs to no single curve."""
@@ -28,7 +28,7 @@ _CAPTION_LINES = 0.17  # inches per line
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class Series:
     """One line or row of points.
 
     Args:
@@ -76,7 +76,7 @@ class Panel:
     title: str
     x_label: str
     y_label: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Series, ...]
     x_scale: Literal["linear", "log"] = "linear"
     y_scale: Literal["linear", "log", "symlog"] = "linear"
     x_limits: tuple[float, float] | None = None
@@ -87,7 +87,7 @@ class Panel:
     legend_columns: int = 1
     same_units: bool = False
 
-    def curve(self, label: str, style: str = "line") -> Curve:
+    def curve(self, label: str, style: str = "line") -> Series:
         """The curve of that label and style.
 
         Raises:
@@ -95,7 +95,7 @@ class Panel:
 
         Example:
             >>> import numpy as np
-            >>> panel = Panel("", "", "", (Curve("w", np.zeros(1), np.ones(1)),))
+            >>> panel = Panel("", "", "", (Series("w", np.zeros(1), np.ones(1)),))
             >>> panel.curve("w").y.tolist()
             [1.0]
         """
@@ -222,7 +222,7 @@ def _paint_ticks(axes: Axes, panel: Panel) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10]))
 
 
-def _paint_curve(axes: Axes, curve: Curve) -> None:
+def _paint_curve(axes: Axes, curve: Series) -> None:
     colour = COLOURS[curve.colour % len(COLOURS)]
     x, y, label = tame(curve.x), tame(curve.y), curve.label if curve.listed else None
     if curve.low is not None and curve.high is not None:

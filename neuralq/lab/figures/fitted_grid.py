@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.fitted.diagnosis import diagnose_fitted
 from neuralq.lab.fitted.iteration import fitted_iteration
 from neuralq.lab.fitted.regressors import LeastSquares, LocallyWeighted, NearestNeighbours, Regressor
@@ -43,7 +43,7 @@ def figure_fitted(num_per_side: int = 16, num_iterations: int = 500) -> Drawing:
     if growth is not None and len(top.x) > 60:
         tail = top.x[-60:]
         curves.append(
-            Curve(f"predicted growth {growth:.5f}", tail, top.y[-60] * growth ** (tail - tail[0]) * 3, "dashed", EXACT)
+            Series(f"predicted growth {growth:.5f}", tail, top.y[-60] * growth ** (tail - tail[0]) * 3, "dashed", EXACT)
         )
     assert model.cost_to_go is not None
     exact = float(model.cost_to_go(support).max())
@@ -73,11 +73,11 @@ def figure_fitted(num_per_side: int = 16, num_iterations: int = 500) -> Drawing:
     )
 
 
-def _curves(num_per_side: int, num_iterations: int) -> tuple[list[Curve], dict[str, float]]:
+def _curves(num_per_side: int, num_iterations: int) -> tuple[list[Series], dict[str, float]]:
     """Largest |V| after every sweep with each regressor, and after the last."""
     model = gridworld()
     support = grid_support(model, num_per_side)
-    curves: list[Curve] = []
+    curves: list[Series] = []
     sizes: dict[str, float] = {}
     for colour, (label, regressor, gamma) in enumerate(_CASES):
         # A tolerance that only a sweep without any change meets.
@@ -85,8 +85,8 @@ def _curves(num_per_side: int, num_iterations: int) -> tuple[list[Curve], dict[s
         largest = np.pad(ran.max_abs, (0, num_iterations - ran.iterations), mode="edge")  # where nothing moves any more
         x = np.arange(len(largest), dtype=np.float64)
         if colour == 2:  # nearest neighbours and lines lie on each other
-            curves.append(Curve(label, x[5::20], largest[5::20], "rings", colour))
+            curves.append(Series(label, x[5::20], largest[5::20], "rings", colour))
         else:
-            curves.append(Curve(label, x, largest, colour=colour))
+            curves.append(Series(label, x, largest, colour=colour))
         sizes[label] = float(ran.max_abs[-1])
     return curves, sizes

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuralq.checks import check_choice, check_whole
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Piece
@@ -126,18 +126,18 @@ def figure_hall(sizes: tuple[int, ...] = _SIZES) -> Drawing:
     }
     predicted = np.array([predicted_sweeps(size) for size in sizes])
 
-    def points(gamma: float) -> tuple[Curve, ...]:
+    def points(gamma: float) -> tuple[Series, ...]:
         return (
-            Curve("direct (TD)", n, counted[gamma, "td"], "points", 0),
-            Curve("residual gradient", n, counted[gamma, "residual"], "points", 1),
+            Series("direct (TD)", n, counted[gamma, "td"], "points", 0),
+            Series("residual gradient", n, counted[gamma, "residual"], "points", 1),
         )
 
-    direct = Curve("n", n, n, "dashed", 0)
-    slowest = Curve("slowest mode, closed form", n, predicted, "dashed", 1)
-    guide = Curve("slope 2", n, predicted[-1] * (n / n[-1]) ** 2, "dotted", EXACT)
+    direct = Series("n", n, n, "dashed", 0)
+    slowest = Series("slowest mode, closed form", n, predicted, "dashed", 1)
+    guide = Series("slope 2", n, predicted[-1] * (n / n[-1]) ** 2, "dotted", EXACT)
     soon = np.minimum(n, np.ceil(np.log(0.01) / np.log(0.9)))  # farther states are worth less than the tolerance
-    direct_soon = Curve("n, or 44", n, soon, "dashed", 0)
-    spectral = Curve("all modes", n, np.array([modal_sweeps(size, 0.9) for size in sizes]), "dashed", 1)
+    direct_soon = Series("n, or 44", n, soon, "dashed", 0)
+    spectral = Series("all modes", n, np.array([modal_sweeps(size, 0.9) for size in sizes]), "dashed", 1)
     limits = (0.7 * n.min(), 2.0 * predicted.max())
     return Drawing(
         name="hall",

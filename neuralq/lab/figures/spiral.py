@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.linear.process import linear_process
 from neuralq.types import Floats
 from neuralq_envs.counterexamples.spiral import SpiralValue, blow_up_time, spiral, theta_at
@@ -50,16 +50,16 @@ def figure_spiral(step_sizes: tuple[float, ...] = (1e-4, 1e-5)) -> Drawing:
     t = end * (1 - np.geomspace(1, 1e-6, 160))
     theta = np.array([theta_at(time) for time in t])
     shown = np.linspace(0, 26, 260)
-    in_plane = [Curve("V(θ), closed form", *_plane(shown, curve), "dashed", EXACT)]
-    in_time = [Curve("closed form", t / end, theta, "dashed", EXACT)]
+    in_plane = [Series("V(θ), closed form", *_plane(shown, curve), "dashed", EXACT)]
+    in_time = [Series("closed form", t / end, theta, "dashed", EXACT)]
     for colour, step_size in enumerate(step_sizes):
         updates = spiral_updates(step_size)
         passed = updates[updates <= 26]
         if colour == 0:
-            in_plane.insert(0, Curve(f"updates, α = {step_size:g}", *_plane(passed, curve), "points", 0))
+            in_plane.insert(0, Series(f"updates, α = {step_size:g}", *_plane(passed, curve), "points", 0))
         x = step_size / end * np.arange(float(len(updates)))
         thin = slice(None, None, max(1, len(x) // 28))
-        in_time.append(Curve(f"updates, α = {step_size:g}", x[thin], updates[thin], ("points", "rings")[colour % 2],
+        in_time.append(Series(f"updates, α = {step_size:g}", x[thin], updates[thin], ("points", "rings")[colour % 2],
                              colour))  # fmt: skip
     return Drawing(
         name="spiral",

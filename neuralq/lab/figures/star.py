@@ -13,9 +13,8 @@ by hand. Solid: run. Dashed: exact.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import Method
@@ -24,11 +23,12 @@ from neuralq.lab.methods.emphatic import expected_emphatic_run
 from neuralq.lab.methods.method import Options
 from neuralq.lab.methods.operators import covariance, td
 from neuralq.lab.trial import run
-from neuralq.lab.verdicts.moments import Jumps, jumps
-from neuralq.types import Floats
+from neuralq.lab.verdicts.moments import evolve
+from neuralq.lab.verdicts.update_maps import update_maps
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem, star
 
-__all__ = ["chain_moments", "figure_11_2", "figure_11_5", "figure_11_6", "sampled_weights"]
+__all__ = ["figure_11_2", "figure_11_5", "figure_11_6", "sampled_weights"]
 
 _BAND = (0.1, 0.9)
 _WEIGHTS = (("w1 to w6 (mean)", 0), ("w7", 1), ("w8", 2))
@@ -115,20 +115,20 @@ def figure_11_6(num_sweeps: int = 1000, num_seeds: int = 200, seed: int = 0) -> 
     stationary = _powers(M, problem.initial_weights, steps.astype(int))
     shown = slice(None, None, max(1, num_sweeps // 250))
     grouped, limit = _grouped(path), _grouped(stationary)
-    curves = [Curve(label, steps[shown], grouped[shown, i], colour=i) for label, i in _WEIGHTS]
+    curves = [Series(label, steps[shown], grouped[shown, i], colour=i) for label, i in _WEIGHTS]
     curves += [
-        Curve(f"{label}, limit", steps[shown], limit[shown, i], "dotted", colour=i, listed=False)
+        Series(f"{label}, limit", steps[shown], limit[shown, i], "dotted", colour=i, listed=False)
         for label, i in _WEIGHTS
     ]
-    curves.append(Curve("√VE", steps, value, colour=3))
+    curves.append(Series("√VE", steps, value, colour=3))
     left = Panel("expected sweeps", "sweeps", "weight or error", tuple(curves), legend="upper right", legend_columns=2)
     sampled = run(problem, "etd", num_sweeps, alpha, "markov", num_seeds, seed)
     low, middle, high = sampled.quantiles((0.1, 0.5, 0.9)).T
     x = sampled.steps.astype(np.float64)
     right = Panel(
         "single transitions", "updates", "√VE",
-        (Curve("median of seeds", x, middle, colour=4, low=low, high=high),
-         Curve("expected", steps, value, "dashed", colour=EXACT)),
+        (Series("median of seeds", x, middle, colour=4, low=low, high=high),
+         Series("expected", steps, value, "dashed", colour=EXACT)),
         y_scale="log", y_limits=(1e-3, 3e5), legend="lower right",
     )  # fmt: skip
     return Drawing(
@@ -144,7 +144,7 @@ def figure_11_6(num_sweeps: int = 1000, num_seeds: int = 200, seed: int = 0) -> 
 
 
 def sampled_weights(
-    problem: Problem, chosen: Method, options: Options, step_size: float, steps: NDArray[np.int64], num_seeds: int,
+    problem: Problem, chosen: Method, options: Options, step_size: float, steps: Indices, num_seeds: int,
     seed: int,
 ) -> Floats:  # fmt: skip
     """θ of every seed after the given numbers of updates along the behaviour's chain, ``[R, N, size]``.
@@ -180,42 +180,6 @@ def sampled_weights(
     return np.array(path)
 
 
-def chain_moments(maps: Jumps, theta: Floats, steps: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """E θ ``[R, size]`` and E θθᵀ ``[R, size, size]`` after the given numbers of updates along a chain without end.
-
-    Args:
-        maps: of every transition, from `neuralq.lab.verdicts.moments.jumps`; none may end an episode.
-        theta: where every seed starts, ``[size]``.
-        steps: rising, ``[R]``.
-
-    Raises:
-        ValueError: a transition ends the episode.
-
-    Example:
-        >>> td_zero = method_named("td")
-        >>> maps = jumps(linear_process(star()), td_zero, td_zero.checked({}), 0.01)
-        >>> chain_moments(maps, star().initial_weights, np.array([100]))[0][0, 5:].round(5).tolist()
-        [3.88584, 9.96978, 9.59707]
-    """
-    if (maps.next_row < 0).any():
-        raise ValueError("a transition ends the episode; these moments are of a chain without end")
-    size, n = len(theta), maps.num_rows
-    M = np.zeros((len(maps.M), size + 1, size + 1))  # of (θ, 1), so that constants are part of the map
-    M[:, :size, :size], M[:, :size, size], M[:, size, size] = maps.M, maps.c, 1.0
-    both = np.append(theta, 1.0)
-    V = maps.D[:, None, None] * np.outer(both, both)
-    arrive = np.zeros((n, len(M)))
-    arrive[maps.next_row, np.arange(len(M))] = maps.probability
-    found, wanted = [], set(steps.tolist())
-    for step in range(int(steps[-1]) + 1):
-        if step in wanted:
-            found.append(V.sum(axis=0))
-        moved = M @ V[maps.row] @ np.swapaxes(M, 1, 2)
-        V = (arrive @ moved.reshape(len(M), -1)).reshape(V.shape)
-    total = np.array(found)
-    return total[:, :size, size], total[:, :size, :size]
-
-
 def _sampled_and_expected(
     name: str, given: Options, alpha: float, sizes: tuple[int, int, int], with_errors: bool
 ) -> tuple[Panel, Panel]:
@@ -223,12 +187,12 @@ def _sampled_and_expected(
     num_steps, num_seeds, seed = sizes
     problem, chosen = star(), method_named(name)
     process, options = linear_process(problem), chosen.checked(given)
-    maps = jumps(process, chosen, options, alpha)
+    maps = update_maps(process, chosen, options, alpha)
     theta = np.concatenate([problem.initial_weights, np.zeros(maps.M.shape[1] - process.num_weights)])
     steps = np.unique(np.linspace(0, num_steps, 201).round().astype(np.int64))
     d, x = process.num_weights, steps.astype(np.float64)
     seeds = sampled_weights(problem, chosen, options, alpha, steps, num_seeds, seed)[:, :, :d]
-    mean, second = chain_moments(maps, theta, steps)
+    mean, second = evolve(maps, theta, steps)
     left = _weight_curves(x, _grouped(seeds), _grouped(mean[:, :d]))
     swept = _powers(maps.mean()[0], theta, steps)[:, :d]
     exact = _powers(_expected(chosen, process, options, alpha)[0], theta, steps)[:, :d]
@@ -242,7 +206,7 @@ def _sampled_and_expected(
             right += _with_exact(label, colour, x, ours, None, known)
     nowhere = np.full(1, np.nan)
     for curves in (left, right):
-        curves.append(Curve("exact", nowhere, nowhere, "dashed", colour=EXACT))
+        curves.append(Series("exact", nowhere, nowhere, "dashed", colour=EXACT))
     y_limits = (-4.2, 12.8) if with_errors else None
     both = (
         Panel(title, x_label, y_label, tuple(curves), y_limits=y_limits,
@@ -256,7 +220,7 @@ def _sampled_and_expected(
     return first, second_panel
 
 
-def _weight_curves(x: Floats, seeds: Floats, exact: Floats) -> list[Curve]:
+def _weight_curves(x: Floats, seeds: Floats, exact: Floats) -> list[Series]:
     """Mean and band of the seeds ``[R, N, 3]`` and the exact mean ``[R, 3]``."""
     curves = []
     for label, i in _WEIGHTS:
@@ -265,11 +229,11 @@ def _weight_curves(x: Floats, seeds: Floats, exact: Floats) -> list[Curve]:
     return curves
 
 
-def _with_exact(label: str, colour: int, x: Floats, ours: Floats, seeds: Floats | None, exact: Floats) -> list[Curve]:
+def _with_exact(label: str, colour: int, x: Floats, ours: Floats, seeds: Floats | None, exact: Floats) -> list[Series]:
     low, high = (None, None) if seeds is None else np.quantile(seeds, _BAND, axis=1)
     return [
-        Curve(label, x, ours, colour=colour, low=low, high=high),
-        Curve(f"{label}, exact", x, exact, "dashed", colour=EXACT, listed=False),
+        Series(label, x, ours, colour=colour, low=low, high=high),
+        Series(f"{label}, exact", x, exact, "dashed", colour=EXACT, listed=False),
     ]
 
 
@@ -290,7 +254,7 @@ def _expected(chosen: Method, process: Process, given: Options, alpha: float) ->
     return expected.at(np.zeros(expected.size), alpha)
 
 
-def _powers(M: Floats, theta: Floats, steps: NDArray[np.int64]) -> Floats:
+def _powers(M: Floats, theta: Floats, steps: Indices) -> Floats:
     """Mᵏ θ for rising k, ``[R, size]``; the star has no rewards and so no constants."""
     found = []
     for before, k in zip([0, *steps[:-1].tolist()], steps.tolist(), strict=True):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuralq.lab.figures.drawing import EXACT, Curve, Drawing, Panel
+from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
+from neuralq.lab.figures.star import sampled_weights
 from neuralq.lab.linear.process import linear_process
-from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.operators import td
 from neuralq.lab.trial import run
@@ -45,12 +45,12 @@ def figure_kolter(
         exact[left | right] = _fixed_point_errors(p[left | right], epsilon)
         label = f"fixed point, ε = {epsilon:g}"
         curves += [
-            Curve(label, p[left], exact[left], "dashed", colour),
-            Curve(f"{label}, beyond", p[right], exact[right], "dashed", colour, listed=False),
+            Series(label, p[left], exact[left], "dashed", colour),
+            Series(f"{label}, beyond", p[right], exact[right], "dashed", colour, listed=False),
         ]
     low, middle, high = _lstd_errors(tested, epsilons[0], num_steps, num_seeds, seed)
-    curves.insert(0, Curve(f"LSTD, ε = {epsilons[0]:g}", tested, middle, "points", 0, low, high))
-    best = Curve("best weight, ε = " + f"{epsilons[0]:g}", np.array([0.2, 0.99]), np.full(2, _best_error(epsilons[0])),
+    curves.insert(0, Series(f"LSTD, ε = {epsilons[0]:g}", tested, middle, "points", 0, low, high))
+    best = Series("best weight, ε = " + f"{epsilons[0]:g}", np.array([0.2, 0.99]), np.full(2, _best_error(epsilons[0])),
                  "dotted", EXACT)  # fmt: skip
     known = {f"p* at ε = {epsilon:g}": critical_probability(epsilon) for epsilon in epsilons}
     growth = _kolter_growth(tested, epsilons[0])
@@ -111,7 +111,7 @@ def _lstd_errors(tested: Floats, epsilon: float, num_steps: int, num_seeds: int,
     return np.array(found).T
 
 
-def _kolter_growth(tested: Floats, epsilon: float) -> tuple[Curve, ...]:
+def _kolter_growth(tested: Floats, epsilon: float) -> tuple[Series, ...]:
     """The ratio of the second change of w to the first, and 1 − αA."""
     measured, alpha = [], 0.1
     for p in tested:
@@ -120,8 +120,8 @@ def _kolter_growth(tested: Floats, epsilon: float) -> tuple[Curve, ...]:
     fine = np.linspace(tested[0], tested[-1], 60)
     exact = 1 - alpha * _operators(fine, epsilon)[0]
     return (
-        Curve("measured", tested, np.array(measured), "points", 2),
-        Curve("exact", fine, exact, "dashed", EXACT),
+        Series("measured", tested, np.array(measured), "points", 2),
+        Series("exact", fine, exact, "dashed", EXACT),
     )
 
 
@@ -140,7 +140,11 @@ def figure_chattering(num_steps: int = 20_000, num_seeds: int = 40, seed: int = 
         0.685185
     """
     w_a, w_b = policy_fixed_points()
-    coarse, fine = _sarsa(400, 0.01, num_seeds, seed), _sarsa(num_steps, 0.001, num_seeds, seed + 1)
+    problem, sarsa = chattering(), method_named("sarsa")
+    coarse, fine = (
+        sampled_weights(problem, sarsa, sarsa.defaults, alpha, np.arange(last + 1), num_seeds, seed)[:, :, 0]
+        for last, alpha, seed in ((400, 0.01, seed), (num_steps, 0.001, seed + 1))
+    )
     x = np.arange(len(coarse), dtype=np.float64)
     low, high = np.quantile(coarse, (0.1, 0.9), axis=1)
     wait = num_steps // 10  # until w has come down to 0
@@ -158,29 +162,14 @@ def figure_chattering(num_steps: int = 20_000, num_seeds: int = 40, seed: int = 
         f"seeds; dashed: the exact share of the sliding limit, {greedy_share():.6f}.",
         panels=(
             Panel("the weight", "updates", "w", (
-                Curve("sampled", x, coarse[:, 0], colour=0, low=low, high=high),
-                Curve("limit if a stays greedy", x[[0, -1]], np.full(2, w_a), "dashed", 1),
-                Curve("limit if b stays greedy", x[[0, -1]], np.full(2, w_b), "dashed", 2),
+                Series("sampled", x, coarse[:, 0], colour=0, low=low, high=high),
+                Series("limit if a stays greedy", x[[0, -1]], np.full(2, w_a), "dashed", 1),
+                Series("limit if b stays greedy", x[[0, -1]], np.full(2, w_b), "dashed", 2),
             ), y_limits=(-0.65, 1.3), legend="upper right"),
             Panel("greedy action", "updates", "share of time with a greedy", (
-                Curve("sampled", at, share[1], colour=0, low=share[0], high=share[2]),
-                Curve("exact", at[[0, -1]], np.full(2, greedy_share()), "dashed", EXACT),
+                Series("sampled", at, share[1], colour=0, low=share[0], high=share[2]),
+                Series("exact", at[[0, -1]], np.full(2, greedy_share()), "dashed", EXACT),
             ), y_limits=(0.6, 0.78)),
         ),
         known={"share of a": greedy_share()},
     )  # fmt: skip
-
-
-def _sarsa(num_steps: int, step_size: float, num_seeds: int, seed: int) -> Floats:
-    """The weight before each update and after the last, ``[num_steps + 1, N]``."""
-    problem, chosen = chattering(), method_named("sarsa")
-    process = linear_process(problem)
-    assert chosen.learner is not None
-    start = np.tile(problem.initial_weights, (num_seeds, 1))
-    learner = chosen.learner(process, start, chosen.checked({}))
-    path = [learner.theta[:, 0].copy()]
-    samples = stream(process, "markov", num_seeds, np.random.default_rng(seed))
-    for _, sample in zip(range(num_steps), samples, strict=False):
-        learner.update(sample, step_size)
-        path.append(learner.theta[:, 0].copy())
-    return np.array(path)

@@ -18,12 +18,12 @@ from scipy.sparse.linalg import ArpackError, eigs
 from neuralq.checks import check_discount
 from neuralq.lab.fitted.iteration import FittedRun, Sweep, iterate, sweep_of_model
 from neuralq.lab.fitted.regressors import Hat, Regressor
-from neuralq.mdp import FiniteMDP
+from neuralq.lab.plain import fields_of
+from neuralq.types import Indices
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
 __all__ = [
     "FittedDiagnosis",
-    "derived_mdp",
     "diagnose_fitted",
     "hat_norm",
     "is_averager",
@@ -94,6 +94,15 @@ class FittedDiagnosis:
             f", and along the way that this run takes by {self.ray_growth:.7g}." if self.ray_growth is not None else "."
         )
 
+    def plain(self) -> dict[str, Any]:
+        """The verdict, what it rests on and the run, as JSON takes them."""
+        return {
+            **fields_of(self, "verdict", "averager", "hat_norm", "contraction", "growth", "ray_growth", "gamma"),
+            "certain": self.guaranteed,
+            **self.run.plain(),
+            "explanation": self.explain(),
+        }
+
 
 def diagnose_fitted(
     model: ContinuousModel,
@@ -103,6 +112,7 @@ def diagnose_fitted(
     gamma: float = 1.0,
     num_iterations: int = 1000,
     start: ArrayLike | None = None,
+    exact: ArrayLike | None = None,
     tolerance: float = 1e-10,
 ) -> FittedDiagnosis:
     """Whether fitted iteration converges on this support, by certificate where there is one and by a run otherwise.
@@ -114,6 +124,7 @@ def diagnose_fitted(
         gamma: γ in [0, 1].
         num_iterations: most sweeps of the run.
         start: y before the first sweep, ``[n]``; default 0.
+        exact: the cost-to-go at the support to compare the run with, ``[n]``; None for no comparison.
         tolerance: largest change of y that counts as none.
 
     Raises:
@@ -130,7 +141,7 @@ def diagnose_fitted(
         ('diverges', 3.0336, 1.09168, 1.08504)
     """
     sweep = sweep_of_model(model, np.asarray(support, dtype=np.float64), regressor)
-    run = iterate(sweep, num_iterations=num_iterations, gamma=gamma, start=start, tolerance=tolerance)
+    run = iterate(sweep, num_iterations=num_iterations, gamma=gamma, start=start, exact=exact, tolerance=tolerance)
     if sweep.hat_next is None:
         return FittedDiagnosis(_verdict(run, None), False, None, None, None, None, None, gamma, run)
     averager = is_averager(sweep.hat_next)
@@ -166,7 +177,7 @@ def is_averager(hat: Hat) -> bool:
     return bool(hat.min() >= -_ROUNDING and hat_norm(hat) <= 1 + _ROUNDING)
 
 
-def policy_growth(sweep: Sweep, policy: NDArray[np.int64], gamma: float) -> float:
+def policy_growth(sweep: Sweep, policy: Indices, gamma: float) -> float:
     """The spectral radius of γ H_π: how errors change in a sweep for as long as the greedy policy is π.
 
     Args:
@@ -178,24 +189,23 @@ def policy_growth(sweep: Sweep, policy: NDArray[np.int64], gamma: float) -> floa
         ValueError: the regressor has no hat matrix.
 
     Example:
-        >>> from neuralq.lab.fitted.iteration import sweep_of_mdp
-        >>> loop = FiniteMDP.from_functions(2, 1, lambda s: [0], lambda s, a: [(1.0, 1, 0.0, False)])
-        >>> fit = np.array([[0.2, 0.4], [0.4, 0.8]])  # least squares on features 1 and 2
-        >>> round(policy_growth(sweep_of_mdp(loop, [0, 1], fit), np.zeros(2, int), 0.9), 12)  # 6γ/5
+        >>> ahead = np.array([[0.4, 0.8], [0.4, 0.8]])  # least squares on features 1 and 2; both lead to the second
+        >>> sweep = Sweep(np.zeros((2, 1)), lambda y: (y, y[:, None]), np.zeros(2, bool), ahead)
+        >>> round(policy_growth(sweep, np.zeros(2, int), 0.9), 12)  # 6γ/5
         1.08
     """
     check_discount("gamma", gamma)
     return float(np.abs(_modes(sweep, policy, gamma)[0]).max())
 
 
-def _modes(sweep: Sweep, policy: NDArray[np.int64], gamma: float) -> tuple[NDArray[Any], NDArray[Any]]:
+def _modes(sweep: Sweep, policy: Indices, gamma: float) -> tuple[NDArray[Any], NDArray[Any]]:
     """Eigenvalues and eigenvectors of γ H_π: all of a small matrix, the leading ones of a large one."""
     if sweep.hat_next is None:
         raise ValueError("only a linear smoother has a hat matrix; for a network look at the run")
     n, num_actions = sweep.cost.shape
     rows = sweep.hat_next[np.arange(n) * num_actions + policy]
-    lively = sparse.diags_array(np.where(sweep.is_goal, 0.0, gamma))
-    matrix = lively @ rows
+    active = sparse.diags_array(np.where(sweep.is_goal, 0.0, gamma))
+    matrix = active @ rows
     if n > _SMALL:
         try:
             return cast("tuple[NDArray[Any], NDArray[Any]]", eigs(matrix, k=6, v0=np.ones(n)))
@@ -212,36 +222,6 @@ def _ray_growth(sweep: Sweep, run: FittedRun, gamma: float) -> float | None:
     aligned = np.abs(y @ vectors.conj())  # eigenvectors have length 1
     best = int(aligned.argmax())
     return float(abs(values[best])) if aligned[best] > 1 - 1e-6 else None
-
-
-def derived_mdp(sweep: Sweep) -> FiniteMDP:
-    """The model that fitted iteration with an averager solves: a step leads to point j with probability H(x', j).
-
-    Its states are the support points, its rewards minus the costs; missing row mass ends the episode. The optimal
-    values of this model, negated, are the fixed point y of fitted iteration.
-
-    Raises:
-        ValueError: the regressor is no averager, so there are no such probabilities.
-
-    Source: Gordon 1995.
-
-    Example:
-        >>> from neuralq.lab.fitted.iteration import sweep_of_mdp
-        >>> mdp = FiniteMDP.from_arrays([[[0.5, 0.5], [0.0, 1.0]]], [[1.0], [0.0]])
-        >>> derived_mdp(sweep_of_mdp(mdp, [0], [[1.0], [0.5]])).transition.toarray().tolist()
-        [[0.75]]
-    """
-    if sweep.hat_next is None or not is_averager(sweep.hat_next):
-        raise ValueError(
-            "only an averager (hat rows >= 0 with sums <= 1) derives a model: use nearest neighbours, interpolation "
-            "on a grid, aggregation or a kernel"
-        )
-    n, num_actions = sweep.cost.shape
-    legal = np.isfinite(sweep.cost) & ~sweep.is_goal[:, None]
-    hat = sparse.csr_array(sweep.hat_next)[np.flatnonzero(legal.reshape(-1))]
-    hat.data = np.maximum(hat.data, 0.0)
-    s_tm1, a_tm1 = np.nonzero(legal)
-    return FiniteMDP(n, num_actions, s_tm1, a_tm1, hat, -sweep.cost[legal])
 
 
 def _always_ends(sweep: Sweep) -> bool:

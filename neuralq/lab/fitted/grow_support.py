@@ -15,13 +15,15 @@ are lower, as the fit improves. Here γ = 1: costs of whole paths are compared.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_positive, check_whole
 from neuralq.lab.fitted.regressors import FittedRegressor, Regressor
-from neuralq.types import Floats
+from neuralq.lab.plain import fields_of
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
 __all__ = ["GrownSupport", "confirmed_costs", "greedy_costs", "grow_support"]
@@ -45,7 +47,7 @@ class GrownSupport:
 
     states: Floats
     costs: Floats
-    index: NDArray[np.int64]
+    index: Indices
     fitted: FittedRegressor
     history: tuple[int, ...]
     complete: bool
@@ -54,6 +56,11 @@ class GrownSupport:
     def predict(self, x: Floats) -> Floats:
         """V̂ at any states, ``[q, dim] -> [q]``."""
         return self.fitted.predict(self.costs, x)
+
+    def plain(self) -> dict[str, Any]:
+        """How far it grew, as JSON takes it."""
+        size = {"num_points": len(self.costs), "max_cost": float(self.costs.max())}
+        return {**fields_of(self, "complete", "settled", "history"), **size}
 
 
 def grow_support(

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,11 +27,13 @@ from scipy import sparse
 
 from neuralq.checks import check_discount, check_positive, check_whole
 from neuralq.lab.fitted.regressors import Hat, LinearSmoother, Regressor
-from neuralq.mdp import FiniteMDP
-from neuralq.types import Floats
+from neuralq.lab.plain import fields_of
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples.continuous import ContinuousModel
 
-__all__ = ["FittedRun", "Sweep", "fitted_iteration", "iterate", "sweep_of_mdp", "sweep_of_model"]
+__all__ = ["FittedRun", "Sweep", "fitted_iteration", "iterate", "sweep_of_model"]
+
+_SHOWN = 11
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +42,17 @@ class Sweep:
 
     Args:
         cost: c(x_i, a), ``[n, A]``; infinite where an action is not legal.
-        look: the fit to y at the support and at the successors, ``[n] -> ([n], [n, A])``, 0 where it ended.
+        predict: the fit to y at the support and at the successors, ``[n] -> ([n], [n, A])``, 0 where it ended.
         is_goal: support points whose cost-to-go is 0 by definition, ``[n]``.
         hat_next: the rows of H at the successors, ``[n A, n]``, empty where it ended; None if there is no H.
     """
 
     cost: Floats
-    look: Callable[[Floats], tuple[Floats, Floats]]
+    predict: Callable[[Floats], tuple[Floats, Floats]]
     is_goal: NDArray[np.bool_]
     hat_next: Hat | None
 
-    def back_up(self, next_values: Floats, gamma: float) -> tuple[Floats, NDArray[np.int64]]:
+    def back_up(self, next_values: Floats, gamma: float) -> tuple[Floats, Indices]:
         """One sweep: the new y and the greedy action of each support point (the lowest of equals)."""
         q = self.cost + gamma * next_values
         policy = q.argmin(axis=1)
@@ -73,8 +76,8 @@ class FittedRun:
 
     values: Floats
     targets: Floats
-    policy: NDArray[np.int64]
-    policy_changes: NDArray[np.int64]
+    policy: Indices
+    policy_changes: Indices
     error: Floats | None
     converged: bool
     stopped_on_cap: bool
@@ -91,10 +94,27 @@ class FittedRun:
         return largest
 
     @property
+    def shown(self) -> list[int]:
+        """Some numbers of iterations, evenly spread from 0 to the last: enough to see what happened."""
+        return sorted({round(self.iterations * i / (_SHOWN - 1)) for i in range(_SHOWN)})
+
+    @property
     def growth(self) -> float:
         """The last ratio of successive max |V̂|; 1 where that is 0."""
         largest = self.max_abs
         return float(largest[-1] / largest[-2]) if len(largest) > 1 and largest[-2] > 0 else 1.0
+
+    def plain(self) -> dict[str, Any]:
+        """How it ended, and max |V̂| and the error at the iterations of `shown`, as JSON takes them."""
+        largest, shown = self.max_abs, self.shown
+        return {
+            **fields_of(self, "converged", "stopped_on_cap"),
+            "num_points": self.values.shape[1],
+            "sweeps": self.iterations,
+            "run_growth": self.growth,
+            "max_abs": [[k, float(largest[k])] for k in shown],
+            "error": None if self.error is None else [[k, float(self.error[k])] for k in shown],
+        }
 
 
 def fitted_iteration(
@@ -156,16 +176,7 @@ def iterate(
     tolerance: float = 1e-10,
     cap: float = 1e10,
 ) -> FittedRun:
-    """Sweep after sweep; what `fitted_iteration` does once the sweep is known.
-
-    Raises:
-        ValueError: shapes that do not fit, or a number out of range.
-
-    Example:
-        >>> walk = FiniteMDP.from_functions(2, 1, lambda s: [0], lambda s, a: [(1.0, 1, -1.0, s == 1)])
-        >>> iterate(sweep_of_mdp(walk, np.arange(2), np.eye(2))).values.tolist()
-        [[0.0, 0.0], [1.0, 1.0], [2.0, 1.0], [2.0, 1.0]]
-    """
+    """Sweep after sweep: what `fitted_iteration` does once the sweep is known, with its arguments and refusals."""
     check_discount("gamma", gamma)
     check_whole("num_iterations", num_iterations)
     check_positive("tolerance", tolerance)
@@ -173,13 +184,13 @@ def iterate(
     n = len(sweep.cost)
     y = _vector("start", np.zeros(n) if start is None else start, n)
     reference = None if exact is None else _vector("exact", exact, n)
-    fit, ahead = sweep.look(y)
+    fit, ahead = sweep.predict(y)
     values, changes = [fit], []
     limit, converged, stopped = np.inf, False, False
     _, policy = sweep.back_up(ahead, gamma)
     for k in range(num_iterations):
         fresh, chosen = sweep.back_up(ahead, gamma)
-        fit, ahead = sweep.look(fresh) if np.isfinite(fresh).all() else (fresh, ahead)
+        fit, ahead = sweep.predict(fresh) if np.isfinite(fresh).all() else (fresh, ahead)
         if not (np.isfinite(fit).all() and np.isfinite(ahead).all()):
             stopped = True
             break
@@ -218,8 +229,8 @@ def sweep_of_model(model: ContinuousModel, support: Floats, regressor: Regressor
     is_goal = model.is_goal(support)
     if isinstance(fitted, LinearSmoother):
         at_support, at_next = fitted.operator(support), fitted.operator(successor[goes_on])
-        look = _scatter(lambda y: (at_support(y), at_next(y)), goes_on, num_actions)
-        return Sweep(steps.cost, look, is_goal, _spread(fitted.hat(successor[goes_on]), goes_on))
+        predict = _scatter(lambda y: (at_support(y), at_next(y)), goes_on, num_actions)
+        return Sweep(steps.cost, predict, is_goal, _spread(fitted.hat(successor[goes_on]), goes_on))
     queries = np.concatenate([support, successor[goes_on]])
 
     def both(y: Floats) -> tuple[Floats, Floats]:
@@ -229,58 +240,18 @@ def sweep_of_model(model: ContinuousModel, support: Floats, regressor: Regressor
     return Sweep(steps.cost, _scatter(both, goes_on, num_actions), is_goal, None)
 
 
-def sweep_of_mdp(mdp: FiniteMDP, support: ArrayLike, hat: ArrayLike) -> Sweep:
-    """A sweep over some states of a finite model, the others being filled in by a linear smoother.
-
-    Costs are minus the rewards, so the run finds minus the values. A row's discount multiplies its hat row.
-
-    Args:
-        mdp: the model.
-        support: numbers of the states that are backed up, ``[n]``.
-        hat: H, ``[S, n]``; rows of terminal states count as 0.
-
-    Raises:
-        ValueError: a support that is no list of different states, or H of another shape.
-
-    Example:
-        >>> mdp = FiniteMDP.from_arrays([[[0.5, 0.5], [0.0, 1.0]]], [[1.0], [0.0]])
-        >>> sweep_of_mdp(mdp, [0], [[1.0], [0.5]]).hat_next.tolist()
-        [[0.75]]
-    """
-    states = np.asarray(support, dtype=np.int64)
-    if states.ndim != 1 or len(np.unique(states)) != len(states) or not len(states):
-        raise ValueError(f"support must list different states, got {states.tolist()}")
-    if states.min() < 0 or states.max() >= mdp.num_states:
-        raise ValueError(f"support must hold states in 0..{mdp.num_states - 1}, got {states.tolist()}")
-    given = np.asarray(hat, dtype=np.float64)
-    if given.shape != (mdp.num_states, len(states)):
-        raise ValueError(f"hat must have shape ({mdp.num_states}, {len(states)}), got {given.shape}")
-    smoother = np.where(mdp.is_terminal[:, None], 0.0, given)
-    rows = mdp.row_index[states]
-    legal = rows >= 0
-    cost = np.where(legal, -mdp.reward[rows], np.inf)
-    onward = mdp.row_discount[:, None] * (mdp.transition @ smoother)
-    at_next = np.where(legal.reshape(-1)[:, None], onward[rows.reshape(-1)], 0.0)
-    at_support = smoother[states]
-
-    def look(y: Floats) -> tuple[Floats, Floats]:
-        return at_support @ y, (at_next @ y).reshape(rows.shape)
-
-    return Sweep(cost, look, mdp.is_terminal[states], at_next)
-
-
 def _scatter(
     both: Callable[[Floats], tuple[Floats, Floats]], goes_on: NDArray[np.bool_], num_actions: int
 ) -> Callable[[Floats], tuple[Floats, Floats]]:
     """The fit at the support and at all successors, from the fit at those that go on; the others are worth 0."""
 
-    def look(y: Floats) -> tuple[Floats, Floats]:
+    def predict(y: Floats) -> tuple[Floats, Floats]:
         here, onward = both(y)
         ahead = np.zeros(len(goes_on))
         ahead[goes_on] = onward
         return here, ahead.reshape(-1, num_actions)
 
-    return look
+    return predict
 
 
 def _spread(hat: Hat, goes_on: NDArray[np.bool_]) -> Hat:

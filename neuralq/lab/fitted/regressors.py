@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from neuralq.checks import check_choice, check_positive, check_whole
-from neuralq.types import Floats
+from neuralq.types import Floats, Indices
 
 __all__ = [
     "FittedRegressor",
@@ -247,11 +246,11 @@ class StateAggregation:
     high: tuple[float, ...]
     num_per_side: int
 
-    def _box(self, x: Floats) -> NDArray[np.int64]:
+    def _box(self, x: Floats) -> Indices:
         low, high = np.array(self.low), np.array(self.high)
         place = np.clip(np.floor((x - low) / (high - low) * self.num_per_side), 0, self.num_per_side - 1)
         sides = (self.num_per_side,) * len(low)
-        box: NDArray[np.int64] = np.ravel_multi_index(tuple(place.astype(np.int64).T), sides)
+        box: Indices = np.ravel_multi_index(tuple(place.astype(np.int64).T), sides)
         return box
 
     def fit(self, x_support: Floats) -> LinearSmoother:
@@ -352,7 +351,7 @@ def _gaussian(x: Floats, centres: Floats, bandwidth: float) -> Floats:
     return weight
 
 
-def _nearest(x: Floats, support: Floats, k: int) -> tuple[Floats, NDArray[np.int64]]:
+def _nearest(x: Floats, support: Floats, k: int) -> tuple[Floats, Indices]:
     """Distance and number of the k nearest support points, some million pairs at a time."""
     parts = []
     for block in np.array_split(x, 1 + len(x) * len(support) // 4_000_000):
@@ -363,7 +362,7 @@ def _nearest(x: Floats, support: Floats, k: int) -> tuple[Floats, NDArray[np.int
     return np.concatenate([d for d, _ in parts]), np.concatenate([i for _, i in parts])
 
 
-def _rows(weight: Floats, index: NDArray[np.int64], num_support: int) -> sparse.csr_array:
+def _rows(weight: Floats, index: Indices, num_support: int) -> sparse.csr_array:
     """A sparse hat matrix from k weights and k support points a row."""
     q, k = weight.shape
     starts = np.arange(0, q * k + 1, k)

@@ -4,10 +4,10 @@ The n rows are the states of a problem that learns V, or the legal pairs (s, a) 
 
     P(i, j)      chance to go from row i to row j under the target policy, row discounts included, ends left out
     P_mu(i, j)   the same under the behaviour policy
-    arc k        one way to go on under the behaviour: (row, next row or the end, chance, ratio, reward, discount)
+    transition   one way to go on under the behaviour: (row, next row or the end, chance, ratio, reward, discount)
 
-and the ratio of an arc is its chance under the target over that under the behaviour: π(a|s)/μ(a|s) between states and
-π(a'|s')/μ(a'|s') between pairs, whose own action is given. So a method that evaluates a policy is written once.
+and the ratio of a transition is its chance under the target over that under the behaviour: π(a|s)/μ(a|s) between states
+and π(a'|s')/μ(a'|s') between pairs, whose own action is given. So a method that evaluates a policy is written once.
 Terminal states are no rows: entering one ends the episode, with a successor feature of 0.
 """
 
@@ -15,15 +15,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from neuralq.exact import resolvent
 from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem
 
-__all__ = ["Arcs", "Process", "linear_process"]
+__all__ = ["Process", "Transitions", "check_values", "linear_process"]
 
 
 LARGEST_DENSE = 2000
@@ -31,7 +33,7 @@ LARGEST_DENSE = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Arcs:
+class Transitions:
     """Every way to go on that has a chance under the behaviour policy, sorted by row, ``[K]`` each.
 
     Args:
@@ -41,7 +43,7 @@ class Arcs:
         rho: importance ratio, chance under the target over ``probability``; 0 where the target never goes.
         reward: expected reward of the action taken.
         discount: γ, or 0 where the episode ends.
-        starts: arcs of row i are ``starts[i]:starts[i + 1]``, ``[n + 1]``.
+        starts: transitions of row i are ``starts[i]:starts[i + 1]``, ``[n + 1]``.
     """
 
     row: Indices
@@ -53,13 +55,29 @@ class Arcs:
     starts: Indices
 
     @cached_property
-    def ladder(self) -> Floats:
-        """Row number plus the chance of this arc and of those before it in its row, to look uniform draws up in."""
+    def cumulative(self) -> Floats:
+        """Row number plus the chance of a transition and of those before it in its row, to look uniform draws up in."""
         total = np.cumsum(self.probability)
         before = np.concatenate([[0.0], total])[self.starts[:-1]]
         within = np.minimum(total - before[self.row], 1.0)
-        within[self.starts[1:] - 1] = 1.0  # whatever rounding left of the last arc's share
+        within[self.starts[1:] - 1] = 1.0  # whatever rounding left of the last transition's share
         return np.asarray(self.row + within)
+
+    def drawn_from(self, row: Indices, u: Floats) -> Indices:
+        """A transition of each given row, ``[N]``, with its chance, by uniform draws ``[N]``."""
+        found: Indices = np.minimum(np.searchsorted(self.cumulative, row + u, side="right"), self.starts[row + 1] - 1)
+        return found
+
+    def matrix(self, weight: Floats) -> Floats | sparse.csr_array:
+        """Weights of the transitions ``[K]`` as a matrix from row to row, ``[n, n]``; an end has no column."""
+        n, inside = len(self.starts) - 1, self.next_row >= 0
+        entries = (weight[inside], (self.row[inside], self.next_row[inside]))
+        chain = sparse.csr_array(sparse.coo_array(entries, shape=(n, n)))
+        return chain.toarray() if n <= LARGEST_DENSE else chain
+
+    def sums(self, weight: Floats) -> Floats:
+        """Weights of the transitions ``[K]`` summed for each row, ``[n]``."""
+        return np.bincount(self.row, weights=weight, minlength=len(self.starts) - 1).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +93,8 @@ class Process:
         D: how often each row is updated, ``[n]``, sums to 1.
         start: where episodes begin, ``[n]``.
         gamma: γ.
-        arcs: every way to go on under the behaviour.
-        target_arcs: every way to go on under the target.
+        transitions: every way to go on under the behaviour.
+        target_transitions: every way to go on under the target.
         pairs: state and action of every row where rows are pairs, ``[n, 2]``; None where they are states.
         state: state of every row, ``[n]``.
         target_policy: π(a|s) of the problem, ``[S, A]``.
@@ -92,8 +110,8 @@ class Process:
     D: Floats
     start: Floats
     gamma: float
-    arcs: Arcs
-    target_arcs: Arcs
+    transitions: Transitions
+    target_transitions: Transitions
     pairs: Indices | None
     state: Indices
     target_policy: Floats
@@ -115,6 +133,12 @@ class Process:
         """The exact values of the target policy, (I − γP)⁻¹ r, ``[n]``."""
         return resolvent(sparse.csr_array(self.P), self.r, self.gamma)
 
+    def seen(self, row: Indices) -> Floats:
+        """Features of some rows, 0 for an end, ``[N] -> [N, d]``."""
+        x: Floats = self.X[row]
+        x[row < 0] = 0.0
+        return x
+
     def with_features(self, X: Floats) -> Process:
         """The same chains seen through other features, ``[n, d']``."""
         return replace(self, X=X)
@@ -131,7 +155,7 @@ class Process:
 
 
 def linear_process(problem: Problem) -> Process:
-    """A problem becomes rows, chains and arcs.
+    """A problem becomes rows, chains and transitions.
 
     A row's discount below 1 counts as the chance that the episode goes on, as in simulation. Rewards are the expected
     ones of each pair.
@@ -139,28 +163,43 @@ def linear_process(problem: Problem) -> Process:
     Example:
         >>> from neuralq_envs.counterexamples import star
         >>> process = linear_process(star())
-        >>> process.num_rows, len(process.arcs.row), process.visible.shape
+        >>> process.num_rows, len(process.transitions.row), process.visible.shape
         (7, 49, (8, 7))
-        >>> sorted(set(process.arcs.rho.round(9).tolist()))  # dashed, solid
+        >>> sorted(set(process.transitions.rho.round(9).tolist()))  # dashed, solid
         [0.0, 7.0]
     """
     return _of_pairs(problem) if problem.learns_q else _of_states(problem)
 
 
+def check_values(problem: Problem) -> None:
+    """With γ = 1 there are values only where every path ends.
+
+    Raises:
+        ValueError: the values of the target policy are not defined.
+    """
+    try:
+        defined = problem.gamma < 1 or bool(np.isfinite(linear_process(problem).v).all())
+    except (RuntimeError, ValueError):
+        defined = False
+    if not defined:
+        raise ValueError(f"{problem.name} never ends, so it has no values with γ = 1; choose a gamma below 1")
+
+
 def _of_states(problem: Problem) -> Process:
     """Rows are the states that have actions."""
     mdp = problem.mdp
-    lively = np.flatnonzero(~mdp.is_terminal)
+    active = np.flatnonzero(~mdp.is_terminal)
     number = np.full(mdp.num_states, -1, dtype=np.int64)
-    number[lively] = np.arange(len(lively))
-    arcs = {}
-    for name, policy in (("mu", problem.behaviour_policy), ("pi", problem.target_policy)):
-        chance = policy[mdp.s_tm1, mdp.a_tm1]
-        row, next_row, p, source = _go_on(problem, number, number[mdp.s_tm1], chance)
-        ratio = problem.importance_ratio[mdp.s_tm1[source], mdp.a_tm1[source]] if name == "mu" else np.ones(len(p))
-        arcs[name] = _arcs(problem, len(lively), row, next_row, p, ratio, mdp.reward[source])
-    return _assemble(problem, problem.features[lively], problem.state_distribution[lively],
-                     mdp.start_distribution[lively], arcs["mu"], arcs["pi"], None, lively, None)  # fmt: skip
+    number[active] = np.arange(len(active))
+    chains = []
+    for policy, ratio in ((problem.behaviour_policy, problem.importance_ratio), (problem.target_policy, None)):
+        row, next_row, p, source = _go_on(problem, number, number[mdp.s_tm1], policy[mdp.s_tm1, mdp.a_tm1])
+        rho = np.ones(len(p)) if ratio is None else ratio[mdp.s_tm1[source], mdp.a_tm1[source]]
+        chains.append(_sorted(problem, len(active), row, next_row, p, rho, mdp.reward[source]))
+    return _assembled(
+        problem, *chains, X=np.array(problem.features[active]), D=problem.state_distribution[active],
+        start=mdp.start_distribution[active], pairs=None, state=active, row_of=None,
+    )  # fmt: skip
 
 
 def _of_pairs(problem: Problem) -> Process:
@@ -168,28 +207,28 @@ def _of_pairs(problem: Problem) -> Process:
     mdp, n = problem.mdp, problem.mdp.num_rows
     number = np.where(mdp.is_terminal, -1, np.arange(mdp.num_states))
     row, s_next, p, source = _go_on(problem, number, np.arange(n), np.ones(n))
-    arcs = {}
-    for name, policy in (("mu", problem.behaviour_policy), ("pi", problem.target_policy)):
-        ended = s_next < 0
-        counts = np.where(ended, 1, np.diff(mdp.row_starts)[np.maximum(s_next, 0)])
-        index = np.repeat(np.arange(len(row)), counts)
-        offset = np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
-        next_row = np.where(ended[index], -1, mdp.row_starts[np.maximum(s_next[index], 0)] + offset)
-        here = (mdp.s_tm1[next_row], mdp.a_tm1[next_row])
-        chance = np.where(next_row < 0, 1.0, policy[here])
-        ratio = np.ones(len(index)) if name == "pi" else np.where(next_row < 0, 1.0, problem.importance_ratio[here])
-        kept = chance > 0
-        arcs[name] = _arcs(problem, n, row[index][kept], next_row[kept], (p[index] * chance)[kept], ratio[kept],
-                           mdp.reward[source[index]][kept])  # fmt: skip
-    pairs = np.stack([mdp.s_tm1, mdp.a_tm1], axis=1)
-    D = problem.state_distribution[mdp.s_tm1] * problem.behaviour_policy[mdp.s_tm1, mdp.a_tm1]
-    begin = mdp.start_distribution[mdp.s_tm1] * problem.behaviour_policy[mdp.s_tm1, mdp.a_tm1]
-    return _assemble(problem, problem.features[mdp.s_tm1, mdp.a_tm1], D, begin, arcs["mu"], arcs["pi"], pairs,
-                     mdp.s_tm1, mdp.row_index)  # fmt: skip
+    counts = np.where(s_next < 0, 1, np.diff(mdp.row_starts)[np.maximum(s_next, 0)])
+    index = np.repeat(np.arange(len(row)), counts)
+    offset = np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
+    next_row = np.where(s_next[index] < 0, -1, mdp.row_starts[np.maximum(s_next[index], 0)] + offset)
+    there = (mdp.s_tm1[next_row], mdp.a_tm1[next_row])
+    chains = []
+    for policy, ratio in ((problem.behaviour_policy, problem.importance_ratio), (problem.target_policy, None)):
+        chance = np.where(next_row < 0, 1.0, policy[there])
+        rho = np.ones(len(index)) if ratio is None else np.where(next_row < 0, 1.0, ratio[there])
+        ways = (row[index], next_row, p[index] * chance, rho, mdp.reward[source[index]])
+        chains.append(_sorted(problem, n, *(one[chance > 0] for one in ways)))
+    here = (mdp.s_tm1, mdp.a_tm1)
+    taken = problem.behaviour_policy[here]
+    return _assembled(
+        problem, *chains, X=np.array(problem.features[here]), D=problem.state_distribution[mdp.s_tm1] * taken,
+        start=mdp.start_distribution[mdp.s_tm1] * taken, pairs=np.stack(here, axis=1), state=mdp.s_tm1,
+        row_of=mdp.row_index,
+    )  # fmt: skip
 
 
 def _go_on(problem: Problem, number: Indices, row: Indices, chance: Floats) -> tuple[Indices, Indices, Floats, Indices]:
-    """Model rows spread over their successors, ends included: ``(row, next, probability, model row)`` of each arc.
+    """Model rows spread over their successors, ends included: row, next row, chance and model row of each transition.
 
     Args:
         problem: the problem.
@@ -212,27 +251,18 @@ def _go_on(problem: Problem, number: Indices, row: Indices, chance: Floats) -> t
     return row[source[kept]], successor[kept], p[kept], source[kept]
 
 
-def _arcs(problem: Problem, n: int, row: Indices, next_row: Indices, p: Floats, rho: Floats, reward: Floats) -> Arcs:
-    order = np.lexsort((next_row, row))
-    row, next_row = row[order], next_row[order]
+def _sorted(problem: Problem, n: int, *ways: NDArray[Any]) -> Transitions:
+    order = np.lexsort((ways[1], ways[0]))
+    row, next_row, probability, rho, reward = (one[order] for one in ways)
     discount = np.where(next_row < 0, 0.0, problem.gamma)
     starts = np.searchsorted(row, np.arange(n + 1)).astype(np.int64)
-    return Arcs(row, next_row, p[order], rho[order], reward[order], discount, starts)
+    return Transitions(row, next_row, probability, rho, reward, discount, starts)
 
 
-def _assemble(
-    problem: Problem, X: Floats, D: Floats, start: Floats, arcs: Arcs, target_arcs: Arcs, pairs: Indices | None,
-    state: Indices, row_of: Indices | None,
-) -> Process:  # fmt: skip
-    n = len(D)
-    chains, rewards = [], []
-    for one in (target_arcs, arcs):
-        inside = one.next_row >= 0
-        flow = (one.probability[inside], (one.row[inside], one.next_row[inside]))
-        chain = sparse.csr_array(sparse.coo_array(flow, shape=(n, n)))
-        chains.append(chain.toarray() if n <= LARGEST_DENSE else chain)
-        rewards.append(np.bincount(one.row, weights=one.probability * one.reward, minlength=n).astype(np.float64))
+def _assembled(problem: Problem, behaviour: Transitions, target: Transitions, **rows: Any) -> Process:
+    P, P_mu = (one.matrix(one.probability) for one in (target, behaviour))
+    r, r_mu = (one.sums(one.probability * one.reward) for one in (target, behaviour))
     return Process(
-        np.array(X), chains[0], chains[1], rewards[0], rewards[1], D, start, problem.gamma, arcs, target_arcs, pairs,
-        state, problem.target_policy, problem.behaviour_policy, row_of,
+        P=P, P_mu=P_mu, r=r, r_mu=r_mu, gamma=problem.gamma, transitions=behaviour, target_transitions=target,
+        target_policy=problem.target_policy, behaviour_policy=problem.behaviour_policy, **rows,
     )  # fmt: skip

@@ -9,16 +9,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.lab.linear.process import Arcs, Process
+from neuralq.lab.linear.process import Process
 from neuralq.types import Floats, Indices
 
-__all__ = ["Sample", "Sampling", "sample_of_arcs", "stream"]
+__all__ = ["SampledTransition", "Sampling", "sample_along", "stream"]
 
 Sampling = Literal["expected", "iid", "markov"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sample:
+class SampledTransition:
     """One transition for each of N seeds.
 
     Args:
@@ -46,34 +46,36 @@ class Sample:
     begins: NDArray[np.bool_]
 
 
-def sample_of_arcs(process: Process, arc: Indices, second: Indices, begins: NDArray[np.bool_]) -> Sample:
-    """The transitions along given arcs of the behaviour, with second successors along given arcs of the target.
+def sample_along(
+    process: Process, transition: Indices, second: Indices, begins: NDArray[np.bool_]
+) -> SampledTransition:
+    """Given transitions of the behaviour as samples, with second successors along given transitions of the target.
 
     Args:
         process: the problem.
-        arc: indices into ``process.arcs``, ``[N]``.
-        second: indices into ``process.target_arcs``, of the same rows, ``[N]``.
+        transition: indices into ``process.transitions``, ``[N]``.
+        second: indices into ``process.target_transitions``, of the same rows, ``[N]``.
         begins: ``[N]``.
     """
-    arcs, target = process.arcs, process.target_arcs
-    row, next_row = arcs.row[arc], arcs.next_row[arc]
-    return Sample(
+    transitions, target = process.transitions, process.target_transitions
+    row, next_row = transitions.row[transition], transitions.next_row[transition]
+    return SampledTransition(
         row,
         next_row,
         process.X[row],
-        _features(process, next_row),
-        _features(process, target.next_row[second]),
+        process.seen(next_row),
+        process.seen(target.next_row[second]),
         target.discount[second],
-        arcs.reward[arc],
-        arcs.rho[arc],
-        arcs.discount[arc],
+        transitions.reward[transition],
+        transitions.rho[transition],
+        transitions.discount[transition],
         begins,
     )
 
 
 def stream(
     process: Process, sampling: Literal["iid", "markov"], num_seeds: int, rng: np.random.Generator
-) -> Iterator[Sample]:
+) -> Iterator[SampledTransition]:
     """Transitions without end for ``num_seeds`` independent seeds.
 
     * ``"iid"``: every row is drawn from D anew, so nothing connects one transition to the next.
@@ -92,9 +94,9 @@ def stream(
     row = _draw(visits, rng.random(num_seeds))
     begins = np.ones(num_seeds, dtype=bool)
     while True:
-        arc = _climb(process.arcs, row, rng.random(num_seeds))
-        second = _climb(process.target_arcs, row, rng.random(num_seeds))
-        sample = sample_of_arcs(process, arc, second, begins)
+        transition = process.transitions.drawn_from(row, rng.random(num_seeds))
+        second = process.target_transitions.drawn_from(row, rng.random(num_seeds))
+        sample = sample_along(process, transition, second, begins)
         yield sample
         if sampling == "iid":
             row = _draw(visits, rng.random(num_seeds))
@@ -107,18 +109,6 @@ def stream(
         begins = ended
 
 
-def _features(process: Process, row: Indices) -> Floats:
-    x = process.X[row]
-    x[row < 0] = 0.0
-    return x
-
-
 def _draw(cumulative: Floats, u: Floats) -> Indices:
     """Indices with the chances whose running sum is given; never one of chance 0."""
     return np.asarray(np.searchsorted(cumulative, u * cumulative[-1], side="right"), dtype=np.int64)
-
-
-def _climb(arcs: Arcs, row: Indices, u: Floats) -> Indices:
-    """An arc of each row with its chance."""
-    found: Indices = np.minimum(np.searchsorted(arcs.ladder, row + u, side="right"), arcs.starts[row + 1] - 1)
-    return found

@@ -1,25 +1,32 @@
-"""Every method of the lab: its expected update and its sampled update, on any problem."""
+"""Every method of the lab: its expected update and its sampled update, on any problem.
 
-from neuralq.lab.methods.control import Q_LEARNING, SARSA
-from neuralq.lab.methods.emphatic import ETD
-from neuralq.lab.methods.gq import GQ, GREEDY_GQ
-from neuralq.lab.methods.gradient import GTD, GTD2, GTD2_MP, HTD, TDC, TDRC
-from neuralq.lab.methods.least_squares import BRM, FITTED, FITTED_Q, LSPI, LSTD
-from neuralq.lab.methods.method import Expected, Learner, Method, flow
-from neuralq.lab.methods.multistep import EXPECTED_SARSA, NAIVE_Q, NSTEP, RETRACE, TREE_BACKUP, VTRACE
-from neuralq.lab.methods.residual_adaptive import RESIDUAL_ADAPTIVE
-from neuralq.lab.methods.targets import HARD_TARGET, POLYAK_TARGET, PROJECTED_TARGET
-from neuralq.lab.methods.td import NAIVE_RESIDUAL, RESIDUAL, TD
+A method is a record in a module of this folder. All modules here are read, so that a new file is all that a new method
+takes: commands, the page and the matrix then know it.
+"""
 
-__all__ = ["METHODS", "Expected", "Learner", "Method", "flow", "method"]
+from __future__ import annotations
 
-METHODS: tuple[Method, ...] = (
-    *(TD, RESIDUAL, RESIDUAL_ADAPTIVE, NAIVE_RESIDUAL),
-    *(GTD, GTD2, GTD2_MP, TDC, TDRC, HTD, GQ, GREEDY_GQ),
-    *(ETD, NSTEP, VTRACE, HARD_TARGET, POLYAK_TARGET, PROJECTED_TARGET),
-    *(LSTD, BRM, FITTED, FITTED_Q, LSPI),
-    *(EXPECTED_SARSA, TREE_BACKUP, RETRACE, NAIVE_Q, Q_LEARNING, SARSA),
-)
+import importlib
+import pkgutil
+
+from neuralq.lab.methods.method import Expected, Method, Option, SampledUpdate, flow
+
+__all__ = ["METHODS", "Expected", "Method", "Option", "SampledUpdate", "flow", "method"]
+
+
+def _discovered() -> dict[str, Method]:
+    """The records of all modules here, by name."""
+    found: dict[str, Method] = {}
+    for module in pkgutil.iter_modules(__path__):
+        for one in vars(importlib.import_module(f"{__name__}.{module.name}")).values():
+            if isinstance(one, Method) and found.setdefault(one.name, one) is not one:
+                raise ValueError(
+                    f"two methods are named {one.name!r}, the second in {module.name}; give it another name"
+                )
+    return found
+
+
+METHODS: tuple[Method, ...] = tuple(sorted(_discovered().values(), key=lambda one: (one.place, one.name)))
 
 
 def method(name: str) -> Method:

@@ -16,7 +16,16 @@ from scipy.sparse.linalg import splu
 from neuralq.lab.linear.process import Process
 from neuralq.types import Floats, Indices
 
-__all__ = ["chain_of", "epsilon_greedy", "greedy_policy", "greedy_values", "pairs_of", "solve_chain", "visits_of"]
+__all__ = [
+    "Chain",
+    "chain_of",
+    "epsilon_greedy",
+    "greedy_policy",
+    "greedy_values",
+    "pairs_of",
+    "solve_chain",
+    "visits_of",
+]
 
 Chain: TypeAlias = Floats | sparse.csr_array
 
@@ -63,12 +72,12 @@ def pairs_of(process: Process, method: str) -> Indices:
         >>> from neuralq_envs.counterexamples import star
         >>> pairs_of(linear_process(star()), "q-learning")
         Traceback (most recent call last):
-        ValueError: q-learning compares actions: ... got one row of features per state
+        ValueError: q-learning compares actions: ... give the problem features [S, A, d], not [S, d]
     """
     if process.row_of is None:
         raise ValueError(
-            f"{method} compares actions: it needs features of state-action pairs [S, A, d], "
-            "got one row of features per state"
+            f"{method} compares actions: it learns values of state-action pairs; give the problem features [S, A, d], "
+            "not [S, d]"
         )
     return process.row_of
 
@@ -87,10 +96,8 @@ def greedy_policy(process: Process, row_of: Indices, w: Floats, epsilon: float =
 
     Example:
         >>> from neuralq.lab.linear.process import linear_process
-        >>> from neuralq.mdp import FiniteMDP
-        >>> from neuralq_envs.counterexamples import Problem
-        >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])
-        >>> process = linear_process(Problem.from_mdp(mdp, [[[1.0], [2.0]]], gamma=0.9))
+        >>> from neuralq_envs.counterexamples.chattering import chattering
+        >>> process = linear_process(chattering())  # one state, two actions with the features 1 and 2
         >>> greedy_policy(process, process.row_of, np.array([1.0]), epsilon=0.1).round(12).tolist()
         [[0.05, 0.95]]
     """
@@ -106,8 +113,8 @@ def epsilon_greedy(row_of: Indices, best: Indices, epsilon: float) -> Floats:
     """
     legal = row_of >= 0
     policy = np.where(legal, epsilon / np.maximum(legal.sum(axis=1, keepdims=True), 1), 0.0)
-    lively = np.flatnonzero(legal.any(axis=1))
-    policy[lively, best[lively]] += 1.0 - epsilon
+    active = np.flatnonzero(legal.any(axis=1))
+    policy[active, best[active]] += 1.0 - epsilon
     return policy
 
 
@@ -135,17 +142,15 @@ def visits_of(process: Process, row_of: Indices, policy: Floats) -> Floats:
 
     Example:
         >>> from neuralq.lab.linear.process import linear_process
-        >>> from neuralq.mdp import FiniteMDP
-        >>> from neuralq_envs.counterexamples import Problem
-        >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])
-        >>> process = linear_process(Problem.from_mdp(mdp, [[[1.0], [2.0]]], gamma=0.9))
+        >>> from neuralq_envs.counterexamples.chattering import chattering
+        >>> process = linear_process(chattering())  # one state, two actions with the features 1 and 2
         >>> visits_of(process, process.row_of, np.array([[0.25, 0.75]])).tolist()
         [0.25, 0.75]
     """
     choices = _choices(process, row_of, policy)
-    lively = np.flatnonzero((row_of >= 0).any(axis=1))
-    inside = (choices @ _into_states(process, row_of)).toarray()[np.ix_(lively, lively)]
-    start = np.bincount(process.state, weights=process.start, minlength=len(row_of))[lively]
+    active = np.flatnonzero((row_of >= 0).any(axis=1))
+    inside = (choices @ _into_states(process, row_of)).toarray()[np.ix_(active, active)]
+    start = np.bincount(process.state, weights=process.start, minlength=len(row_of))[active]
     chain = inside + np.maximum(1.0 - inside.sum(axis=1), 0.0)[:, None] * start
     _, singular, right = np.linalg.svd(chain.T - np.eye(len(chain)))
     if len(singular) > 1 and singular[-2] < 1e-10:
@@ -154,7 +159,7 @@ def visits_of(process: Process, row_of: Indices, policy: Floats) -> Floats:
             "pair depends on chance; raise epsilon, or learn off-policy from a fixed behaviour (method q-learning)"
         )
     share = np.abs(right[-1]) / np.abs(right[-1]).sum()
-    visits: Floats = (choices[lively].T @ share) if len(lively) else np.zeros(process.num_rows)
+    visits: Floats = (choices[active].T @ share) if len(active) else np.zeros(process.num_rows)
     return visits
 
 

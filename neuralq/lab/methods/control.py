@@ -19,14 +19,12 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neuralq.checks import check_fraction
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import Sample
+from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import chain_of, epsilon_greedy, greedy_values, pairs_of, visits_of
-from neuralq.lab.methods.method import Expected, Method, Options, Piece
-from neuralq.types import Floats
+from neuralq.lab.methods.method import Expected, Method, Option, Options, Piece
+from neuralq.types import Floats, Indices
 
 __all__ = ["Q_LEARNING", "SARSA", "piece_of_policy"]
 
@@ -49,10 +47,8 @@ def piece_of_policy(process: Process, policy: Floats, on_policy: bool = False) -
 
     Example:
         >>> from neuralq.lab.linear.process import linear_process
-        >>> from neuralq.mdp import FiniteMDP
-        >>> from neuralq_envs.counterexamples import Problem
-        >>> mdp = FiniteMDP.from_arrays([[[0.0]], [[0.0]]], [[1.0, -1.0]], substochastic=True)
-        >>> process = linear_process(Problem.from_mdp(mdp, [[[1.0], [2.0]]], gamma=1.0))
+        >>> from neuralq_envs.counterexamples.chattering import chattering
+        >>> process = linear_process(chattering())  # one state, two actions with the features 1 and 2
         >>> A, b = piece_of_policy(process, np.array([[0.95, 0.05]]), on_policy=True)
         >>> A.round(12).tolist(), b.round(12).tolist()  # .95 · 1 + .05 · 4, .95 · 1 · 1 − .05 · 2 · 1
         ([[1.15]], [0.85])
@@ -70,7 +66,7 @@ class _QLearning:
         self._row_of = pairs_of(process, "q-learning")
         self._X, self._state = process.X, process.state
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         rows = self._row_of[self._state[sample.next_row]]
         values = np.einsum("nad,nd->na", self._X[rows], self.theta)
         best = np.where(rows >= 0, values, -np.inf).max(axis=1)
@@ -84,7 +80,6 @@ class _Sarsa:
         self.theta = w0.copy()
         self._row_of = row_of = pairs_of(process, "sarsa")
         self._process, self._epsilon = process, options["epsilon"]
-        check_fraction("epsilon", self._epsilon)
         s, a = np.nonzero(row_of >= 0)
         self._mu = np.empty(process.num_rows)
         self._mu[row_of[s, a]] = process.behaviour_policy[s, a]
@@ -95,7 +90,7 @@ class _Sarsa:
             )
         _, self._visits = _pieces(process, row_of, self._epsilon)
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         best = greedy_values(self._process, self._row_of, self.theta).argmax(axis=-1)
         greedy, which = np.unique(best, axis=0, return_inverse=True)
         policy = np.empty((len(greedy), self._process.num_rows))
@@ -113,7 +108,7 @@ class _Sarsa:
 
 
 def _pieces(
-    process: Process, row_of: NDArray[np.int64], epsilon: float | None
+    process: Process, row_of: Indices, epsilon: float | None
 ) -> tuple[Callable[[bytes], tuple[Floats, Floats]], Callable[[bytes], Floats]]:
     """What greedy actions, as bytes, lead to: A and b, and how often their own policy visits each row; remembered."""
 
@@ -147,16 +142,15 @@ def _expected_q_learning(process: Process, options: Options) -> Expected:
 
 
 def _expected_sarsa(process: Process, options: Options) -> Expected:
-    check_fraction("epsilon", options["epsilon"])
     return _piecewise(process, "sarsa", options["epsilon"])
 
 
 Q_LEARNING = Method(
     "q-learning", "Q-learning", "Watkins 1989; Baird 1995", {}, _expected_q_learning, _QLearning, rows="pairs",
-    note="piecewise linear: an unstable piece matters only where a run stays in its region",
+    note="piecewise linear: an unstable piece matters only where a run stays in its region", place=90,
 )  # fmt: skip
 SARSA = Method(
-    "sarsa", "Sarsa(0), ε-greedy", "Rummery & Niranjan 1994; Gordon 1996, 2000", {"epsilon": 0.1}, _expected_sarsa,
-    _Sarsa, rows="pairs",
-    note="updates what its own ε-greedy policy visits, whatever the behaviour; bounded, but it may chatter",
+    "sarsa", "Sarsa(0), ε-greedy", "Rummery & Niranjan 1994; Gordon 1996, 2000",
+    {"epsilon": Option(0.1, 0.0, 1.0, "ε, exploration")}, _expected_sarsa, _Sarsa, rows="pairs",
+    note="updates what its own ε-greedy policy visits, whatever the behaviour; bounded, but it may chatter", place=91,
 )  # fmt: skip

@@ -16,18 +16,18 @@ A run that begins at F_0 = i does not start at f but walks there, f_{k+1} = d ·
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 from scipy.sparse.linalg import eigs
 
 from neuralq.checks import check_fraction
-from neuralq.lab.linear.process import LARGEST_DENSE, Process
-from neuralq.lab.linear.sampling import Sample
+from neuralq.lab.linear.process import Process
+from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import solve_chain
-from neuralq.lab.methods.method import Expected, Method, Options, flow
-from neuralq.lab.methods.td import errors
+from neuralq.lab.methods.method import LAMBDA, Expected, Method, Option, Options
+from neuralq.lab.methods.operators import ahead, traced_flow
+from neuralq.lab.methods.trace import Trace, errors
 from neuralq.types import Floats
 
-__all__ = ["ETD", "emphasis", "expected_emphatic_run", "follow_on", "follow_on_second_moment"]
+__all__ = ["ETD", "decay_of", "emphasis", "expected_emphatic_run", "follow_on", "follow_on_second_moment"]
 
 AS_GAMMA = -1.0
 """The value of option ``beta`` that stands for γ, whichever γ the problem has."""
@@ -108,14 +108,12 @@ def follow_on_second_moment(process: Process, beta: float | None = None) -> floa
     """
     decay = process.gamma if beta is None else beta
     check_fraction("beta", decay)
-    arcs, n = process.arcs, process.num_rows
-    inside = arcs.next_row >= 0
-    weight = (arcs.probability * arcs.rho**2)[inside]
-    matrix = sparse.csr_array(sparse.coo_array((weight, (arcs.row[inside], arcs.next_row[inside])), shape=(n, n)))
-    if n <= LARGEST_DENSE:
-        radius = np.abs(np.linalg.eigvals(matrix.toarray())).max()
+    ways = process.transitions
+    chain = ways.matrix(ways.probability * ways.rho**2)
+    if isinstance(chain, np.ndarray):
+        radius = np.abs(np.linalg.eigvals(chain)).max()
     else:
-        radius = np.abs(eigs(matrix, k=1, return_eigenvectors=False, v0=np.ones(n))).max()
+        radius = np.abs(eigs(chain, k=1, return_eigenvectors=False, v0=np.ones(process.num_rows))).max()
     return float(decay**2 * radius)
 
 
@@ -153,42 +151,36 @@ def expected_emphatic_run(process: Process, w0: Floats, step_size: float, num_sw
 class _ETD:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta = w0.copy()
-        self._lambda = options["lambda_"]
-        check_fraction("lambda_", self._lambda)
-        beta = _beta(options)
+        self._lambda, beta = options["lambda_"], decay_of(options)
         self._beta = process.gamma if beta is None else beta
-        check_fraction("beta", self._beta, f"or {AS_GAMMA:g} for γ")
-        self._follow = np.zeros(len(w0))
+        self._trace = Trace(w0.shape, self._lambda)
+        self._follow_on = np.zeros(len(w0))
         self._decay = np.zeros(len(w0))  # ρ_{t−1} β into the present row
-        self._e = np.zeros_like(w0)
-        self._trace_decay = np.zeros(len(w0))  # γλ into the present row
 
-    def update(self, sample: Sample, step_size: float) -> None:
-        goes_on = ~sample.begins
-        self._follow = goes_on * self._decay * self._follow + 1.0
-        emphasis = self._lambda + (1 - self._lambda) * self._follow
-        fade = (goes_on * self._trace_decay)[:, None]
-        self._e = sample.rho[:, None] * (fade * self._e + emphasis[:, None] * sample.x)
-        self.theta += step_size * errors(self.theta, sample)[:, None] * self._e
+    def update(self, sample: SampledTransition, step_size: float) -> None:
+        self._follow_on = ~sample.begins * self._decay * self._follow_on + 1.0
+        emphasis = self._lambda + (1 - self._lambda) * self._follow_on
+        e = self._trace.advance(sample, sample.rho, x=emphasis[:, None] * sample.x)
+        self.theta += step_size * errors(self.theta, sample)[:, None] * e
         self._decay = sample.rho * self._beta * (sample.next_row >= 0)
-        self._trace_decay = sample.discount * self._lambda
 
 
 def _expected_etd(process: Process, options: Options) -> Expected:
     lambda_ = options["lambda_"]
-    m = emphasis(process, lambda_, _beta(options))
-    ahead = np.column_stack([process.X - process.gamma * (process.P @ process.X), process.r])
-    both = process.X.T @ (m[:, None] * solve_chain(process.P, process.gamma * lambda_, ahead))
-    return flow(both[:, :-1], both[:, -1])
+    m = emphasis(process, lambda_, decay_of(options))
+    return traced_flow(process, m, process.P, process.gamma * lambda_, ahead(process), process.r)
 
 
-def _beta(options: Options) -> float | None:
+def decay_of(options: Options) -> float | None:
+    """β of the options; None where it stands for γ."""
     return None if options["beta"] == AS_GAMMA else options["beta"]
 
 
 ETD = Method(
     "etd", "ETD(λ, β)", "Sutton, Mahmood & White 2016; with β Hallak, Tamar, Munos & Mannor 2016",
-    {"lambda_": 0.0, "beta": AS_GAMMA}, _expected_etd, _ETD,
-    remembers=lambda options: options["lambda_"] > 0 or options["beta"] != 0,
+    {"lambda_": LAMBDA,
+     "beta": Option(AS_GAMMA, 0.0, 1.0, "β, decay of the follow-on", special=AS_GAMMA, special_label="γ")},
+    _expected_etd, _ETD, remembers=lambda options: options["lambda_"] > 0 or options["beta"] != 0,
     note="beta = -1 stands for γ, which is ETD(λ); its mean is stable, but the follow-on may have no variance",
+    memory_growth=lambda process, options: follow_on_second_moment(process, decay_of(options)), place=40,
 )  # fmt: skip

@@ -17,12 +17,12 @@ from __future__ import annotations
 import numpy as np
 
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.chains import greedy_values
-from neuralq.lab.methods.gradient import corrected_flow, dot, has_trace, step_ratio, with_helpers
-from neuralq.lab.methods.method import Expected, Method, Options
+from neuralq.lab.linear.sampling import SampledTransition
+from neuralq.lab.methods.chains import greedy_values, pairs_of
+from neuralq.lab.methods.gradient import corrected_flow, with_helpers
+from neuralq.lab.methods.method import LAMBDA, STEP_RATIO, Expected, Method, Options
 from neuralq.lab.methods.operators import covariance, td
-from neuralq.lab.methods.trace import Trace
+from neuralq.lab.methods.trace import Trace, dot
 from neuralq.types import Floats, Indices
 
 __all__ = ["GQ", "GREEDY_GQ", "greedy_rows"]
@@ -30,27 +30,27 @@ __all__ = ["GQ", "GREEDY_GQ", "greedy_rows"]
 
 class _GQ:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        row_of = table_of_pairs(process, "gq")
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
+        row_of = pairs_of(process, "gq")
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
         self._lambda = options["lambda_"]
         self._trace = Trace(w0.shape, self._lambda)
         weight = np.where(row_of >= 0, process.target_policy, 0.0)
         self._mean = np.einsum("sa,sad->sd", weight, process.X[row_of])  # x̄ of every state
         self._state, self._rho = process.state, _own_ratio(process)
 
-    def update(self, sample: Sample, step_size: float) -> None:
-        e = self._trace.follow(sample, before=self._rho[sample.row])
+    def update(self, sample: SampledTransition, step_size: float) -> None:
+        e = self._trace.advance(sample, before=self._rho[sample.row])
         ahead = np.where(sample.next_row[:, None] < 0, 0.0, self._mean[self._state[sample.next_row]])
         self.theta += step_size * _direction(self.theta, sample, e, ahead, self._lambda, self._ratio)
 
 
 class _GreedyGQ:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        self._row_of = table_of_pairs(process, "greedy-gq")
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
+        self._row_of = pairs_of(process, "greedy-gq")
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
         self._X, self._state = process.X, process.state
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w = np.split(self.theta, 2, axis=1)[0]
         choice = self._row_of[self._state[sample.next_row]]
         value = np.where(choice >= 0, np.einsum("nad,nd->na", self._X[choice], w), -np.inf)
@@ -59,7 +59,9 @@ class _GreedyGQ:
         self.theta += step_size * _direction(self.theta, sample, sample.x, ahead, 0.0, self._ratio)
 
 
-def _direction(theta: Floats, sample: Sample, e: Floats, ahead: Floats, lambda_: float, ratio: float) -> Floats:
+def _direction(
+    theta: Floats, sample: SampledTransition, e: Floats, ahead: Floats, lambda_: float, ratio: float
+) -> Floats:
     """Where θ goes per unit of α; ``ahead`` is x̄' and 0 at an end."""
     w, h = np.split(theta, 2, axis=1)
     ahead = sample.discount[:, None] * ahead
@@ -77,17 +79,6 @@ def _own_ratio(process: Process) -> Floats:
     return np.where(mu > 0, pi / np.where(mu > 0, mu, 1.0), 0.0)
 
 
-def table_of_pairs(process: Process, name: str) -> Indices:
-    """The row of every pair, ``[S, A]``.
-
-    Raises:
-        ValueError: the rows are states.
-    """
-    if process.row_of is None:
-        raise ValueError(f"{name} learns values of state-action pairs; give the problem features [S, A, d], not [S, d]")
-    return process.row_of
-
-
 def greedy_rows(process: Process, w: Floats) -> Indices:
     """The row of the greedy pair of every state, ``[S]``, ties to the lowest action; -1 where there is no action.
 
@@ -100,27 +91,25 @@ def greedy_rows(process: Process, w: Floats) -> Indices:
 
     Example:
         >>> from neuralq.lab.linear.process import linear_process
-        >>> from neuralq.mdp import FiniteMDP
-        >>> from neuralq_envs.counterexamples import Problem
-        >>> mdp = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[0.0, 0.0]])
-        >>> process = linear_process(Problem.from_mdp(mdp, [[[1.0], [2.0]]], gamma=0.9))
+        >>> from neuralq_envs.counterexamples.chattering import chattering
+        >>> process = linear_process(chattering())  # one state, two actions with the features 1 and 2
         >>> greedy_rows(process, np.array([3.0])).tolist(), greedy_rows(process, np.zeros(1)).tolist()
         ([1], [0])
     """
-    row_of = table_of_pairs(process, "a greedy policy")
+    row_of = pairs_of(process, "a greedy policy")
     best_action = greedy_values(process, row_of, w).argmax(axis=1)
     best: Indices = np.take_along_axis(row_of, best_action[:, None], axis=1)[:, 0]
     return best
 
 
 def _expected_gq(process: Process, options: Options) -> Expected:
-    table_of_pairs(process, "gq")
-    ratio, (A, b) = step_ratio(options), td(process, options["lambda_"])
+    pairs_of(process, "gq")
+    ratio, (A, b) = options["beta_over_alpha"], td(process, options["lambda_"])
     return corrected_flow(A, b, covariance(process), ratio)
 
 
 def _expected_greedy_gq(process: Process, options: Options) -> Expected:
-    row_of, ratio = table_of_pairs(process, "greedy-gq"), step_ratio(options)
+    row_of, ratio = pairs_of(process, "greedy-gq"), options["beta_over_alpha"]
     weighted, C = process.D[:, None] * process.X, covariance(process)
     into = np.zeros((process.num_rows, len(row_of)))
     into[np.arange(process.num_rows), process.state] = 1.0
@@ -137,10 +126,11 @@ def _expected_greedy_gq(process: Process, options: Options) -> Expected:
 
 
 GQ = Method(
-    "gq", "GQ(λ)", "Maei & Sutton 2010", {"lambda_": 0.0, "beta_over_alpha": 10.0}, _expected_gq, _GQ, rows="pairs",
-    remembers=has_trace,
+    "gq", "GQ(λ)", "Maei & Sutton 2010", {"lambda_": LAMBDA, "beta_over_alpha": STEP_RATIO}, _expected_gq, _GQ,
+    rows="pairs", place=30,
 )  # fmt: skip
 GREEDY_GQ = Method(
-    "greedy-gq", "Greedy-GQ", "Maei, Szepesvári, Bhatnagar & Sutton 2010", {"beta_over_alpha": 10.0},
+    "greedy-gq", "Greedy-GQ", "Maei, Szepesvári, Bhatnagar & Sutton 2010", {"beta_over_alpha": STEP_RATIO},
     _expected_greedy_gq, _GreedyGQ, rows="pairs", note="control: the target policy is greedy in the learned values",
+    place=31,
 )  # fmt: skip

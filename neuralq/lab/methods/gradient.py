@@ -24,26 +24,26 @@ place, which differs at second order in α.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from neuralq.checks import check_positive
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Method, Options, flow
+from neuralq.lab.linear.sampling import SampledTransition
+from neuralq.lab.methods.method import LAMBDA, RIDGE, STEP_RATIO, Expected, Method, Options, flow
 from neuralq.lab.methods.operators import covariance, td
-from neuralq.lab.methods.td import errors
-from neuralq.lab.methods.trace import Trace
+from neuralq.lab.methods.trace import Trace, dot, errors
 from neuralq.types import Floats
 
-__all__ = ["GTD", "GTD2", "GTD2_MP", "HTD", "TDC", "TDRC"]
+__all__ = ["GTD", "GTD2", "GTD2_MP", "HTD", "TDC", "TDRC", "corrected_flow", "with_helpers"]
 
 
 class _GTD:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w, h = np.split(self.theta, 2, axis=1)
         rho, back = sample.rho[:, None], sample.x - sample.discount[:, None] * sample.x_next
         to_w = rho * back * dot(sample.x, h)
@@ -54,18 +54,18 @@ class _GTD:
 class _GTD2:
     def __init__(self, process: Process, w0: Floats, options: Options, extragradient: bool = False) -> None:
         self._extragradient = extragradient
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
         self._lambda = options["lambda_"]
         self._trace = Trace(w0.shape, self._lambda)
 
-    def update(self, sample: Sample, step_size: float) -> None:
-        z = self._trace.follow(sample, sample.rho)
+    def update(self, sample: SampledTransition, step_size: float) -> None:
+        z = self._trace.advance(sample, sample.rho)
         looked_at = self.theta
         if self._extragradient:
             looked_at = self.theta + step_size * self._direction(self.theta, sample, z)
         self.theta += step_size * self._direction(looked_at, sample, z)
 
-    def _direction(self, theta: Floats, sample: Sample, z: Floats) -> Floats:
+    def _direction(self, theta: Floats, sample: SampledTransition, z: Floats) -> Floats:
         w, h = np.split(theta, 2, axis=1)
         ahead = sample.discount[:, None] * sample.x_next
         to_w = dot(sample.x, h) * sample.x - (1 - self._lambda) * dot(z, h) * ahead
@@ -77,13 +77,13 @@ class _TDC:
     """TDC(λ), and TDRC where β > 0."""
 
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
-        self._lambda, self._beta = options["lambda_"], _regularisation(options)
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
+        self._lambda, self._beta = options["lambda_"], options.get("beta", 0.0)
         self._trace = Trace(w0.shape, self._lambda)
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w, h = np.split(self.theta, 2, axis=1)
-        z = self._trace.follow(sample, sample.rho)
+        z = self._trace.advance(sample, sample.rho)
         uncorrected = errors(w, sample)[:, None] * z
         to_w = uncorrected - (1 - self._lambda) * dot(z, h) * sample.discount[:, None] * sample.x_next
         to_h = uncorrected - dot(sample.x, h) * sample.x - self._beta * h
@@ -92,13 +92,13 @@ class _TDC:
 
 class _HTD:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
-        self.theta, self._ratio = with_helpers(w0), step_ratio(options)
+        self.theta, self._ratio = with_helpers(w0), options["beta_over_alpha"]
         self._target = Trace(w0.shape, options["lambda_"])
         self._behaviour = Trace(w0.shape, options["lambda_"])
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w, h = np.split(self.theta, 2, axis=1)
-        z, z_mu = self._target.follow(sample, sample.rho), self._behaviour.follow(sample)
+        z, z_mu = self._target.advance(sample, sample.rho), self._behaviour.advance(sample)
         back = sample.x - sample.discount[:, None] * sample.x_next
         uncorrected = errors(w, sample)[:, None] * z
         to_w = uncorrected + back * dot(z - z_mu, h)
@@ -111,30 +111,6 @@ def with_helpers(w0: Floats) -> Floats:
     return np.hstack([w0, np.zeros_like(w0)])
 
 
-def step_ratio(options: Options) -> float:
-    """η = β/α of the options.
-
-    Raises:
-        ValueError: it is not above 0.
-    """
-    check_positive("beta_over_alpha", options["beta_over_alpha"])
-    return options["beta_over_alpha"]
-
-
-def _regularisation(options: Options) -> float:
-    """How strongly h is drawn to 0: the β of TDRC, 0 for TDC."""
-    beta = options.get("beta", 0.0)
-    if not beta >= 0:
-        raise ValueError(f"beta must be at least 0, got {beta!r}; 0 is TDC")
-    return beta
-
-
-def dot(a: Floats, b: Floats) -> Floats:
-    """The inner product of each seed as a column, ``[N, d] × [N, d] -> [N, 1]``."""
-    product: Floats = np.einsum("nd,nd->n", a, b)[:, None]
-    return product
-
-
 def corrected_flow(A: Floats, b: Floats, C: Floats, ratio: float, beta: float = 0.0) -> Expected:
     """The flow of TDC, G = [[A, (C − A)ᵀ], [ηA, η(C + βI)]], from its A, b and C."""
     G = np.block([[A, (C - A).T], [ratio * A, ratio * (C + beta * np.eye(len(b)))]])
@@ -142,12 +118,12 @@ def corrected_flow(A: Floats, b: Floats, C: Floats, ratio: float, beta: float = 
 
 
 def _expected_gtd(process: Process, options: Options) -> Expected:
-    ratio, (A, b) = step_ratio(options), td(process)
+    ratio, (A, b) = options["beta_over_alpha"], td(process)
     return _descent(A, b, np.eye(len(b)), ratio)
 
 
 def _expected_gtd2(process: Process, options: Options) -> Expected:
-    ratio, (A, b) = step_ratio(options), td(process, options["lambda_"])
+    ratio, (A, b) = options["beta_over_alpha"], td(process, options["lambda_"])
     return _descent(A, b, covariance(process), ratio)
 
 
@@ -157,8 +133,8 @@ def _descent(A: Floats, b: Floats, metric: Floats, ratio: float) -> Expected:
 
 
 def _expected_tdc(process: Process, options: Options) -> Expected:
-    ratio, (A, b) = step_ratio(options), td(process, options["lambda_"])
-    return corrected_flow(A, b, covariance(process), ratio, _regularisation(options))
+    ratio, (A, b) = options["beta_over_alpha"], td(process, options["lambda_"])
+    return corrected_flow(A, b, covariance(process), ratio, options.get("beta", 0.0))
 
 
 def _gtd2_mp(process: Process, w0: Floats, options: Options) -> _GTD2:
@@ -178,41 +154,39 @@ def _expected_gtd2_mp(process: Process, options: Options) -> Expected:
 
 
 def _expected_htd(process: Process, options: Options) -> Expected:
-    ratio, lambda_ = step_ratio(options), options["lambda_"]
+    ratio, lambda_ = options["beta_over_alpha"], options["lambda_"]
     A, b = td(process, lambda_)
     A_mu, _ = td_operator(process.P_mu, process.r_mu, process.X, process.D, process.gamma, lambda_)
     G = np.block([[A, A_mu.T - A.T], [ratio * A, ratio * A_mu.T]])
     return flow(G, np.concatenate([b, ratio * b]))
 
 
-def has_trace(options: Options) -> bool:
-    """Whether λ > 0."""
-    return options["lambda_"] > 0
-
-
+_OPTIONS = {"lambda_": LAMBDA, "beta_over_alpha": STEP_RATIO}
 GTD = Method(
-    "gtd", "GTD", "Sutton, Szepesvári & Maei 2009", {"beta_over_alpha": 10.0}, _expected_gtd, _GTD,
+    "gtd", "GTD", "Sutton, Szepesvári & Maei 2009", {"beta_over_alpha": STEP_RATIO}, _expected_gtd, _GTD, place=20,
 )  # fmt: skip
 GTD2 = Method(
     "gtd2", "GTD2(λ)", "Sutton, Maei, Precup, Bhatnagar, Silver, Szepesvári & Wiewiora 2009; with traces Maei 2011",
-    {"lambda_": 0.0, "beta_over_alpha": 10.0}, _expected_gtd2, _GTD2, remembers=has_trace,
-)  # fmt: skip
-TDC = Method(
-    "tdc", "TDC, GTD(λ)", "Sutton, Maei, Precup, Bhatnagar, Silver, Szepesvári & Wiewiora 2009; with traces Maei 2011",
-    {"lambda_": 0.0, "beta_over_alpha": 10.0}, _expected_tdc, _TDC, remembers=has_trace,
-    note="converges where h is fast enough: a large beta_over_alpha",
-)  # fmt: skip
-TDRC = Method(
-    "tdrc", "TDRC", "Ghiassian, Patterson, Garg, Gupta, White & White 2020",
-    {"lambda_": 0.0, "beta_over_alpha": 1.0, "beta": 1.0}, _expected_tdc, _TDC, remembers=has_trace,
-    note="beta is the regularisation of h, beta_over_alpha the ratio of the step sizes",
+    _OPTIONS, _expected_gtd2, _GTD2, place=21,
 )  # fmt: skip
 GTD2_MP = Method(
     "gtd2-mp", "GTD2(λ)-MP", "Liu, Liu, Ghavamzadeh, Mahadevan & Petrik 2015; with traces White & White 2016",
-    {"lambda_": 0.0, "beta_over_alpha": 10.0}, _expected_gtd2_mp, _gtd2_mp, remembers=has_trace,
+    _OPTIONS, _expected_gtd2_mp, _gtd2_mp,
     note="the sampled update uses one transition for both halves, so that its mean differs at second order in α",
+    place=22,
+)  # fmt: skip
+TDC = Method(
+    "tdc", "TDC, GTD(λ)", "Sutton, Maei, Precup, Bhatnagar, Silver, Szepesvári & Wiewiora 2009; with traces Maei 2011",
+    _OPTIONS, _expected_tdc, _TDC, note="converges where h is fast enough: a large beta_over_alpha", place=23,
+)  # fmt: skip
+TDRC = Method(
+    "tdrc", "TDRC", "Ghiassian, Patterson, Garg, Gupta, White & White 2020",
+    {"lambda_": LAMBDA, "beta_over_alpha": replace(STEP_RATIO, default=1.0),
+     "beta": replace(RIDGE, default=1.0, label="β, regularisation of h")}, _expected_tdc, _TDC,
+    note="beta is the regularisation of h, beta_over_alpha the ratio of the step sizes", place=24,
 )  # fmt: skip
 HTD = Method(
-    "htd", "HTD(λ)", "Hackman 2012; White & White 2016", {"lambda_": 0.0, "beta_over_alpha": 1.0}, _expected_htd, _HTD,
-    remembers=has_trace, note="on-policy it is TD(λ)",
+    "htd", "HTD(λ)", "Hackman 2012; White & White 2016",
+    {"lambda_": LAMBDA, "beta_over_alpha": replace(STEP_RATIO, default=1.0)}, _expected_htd, _HTD,
+    note="on-policy it is TD(λ)", place=25,
 )  # fmt: skip

@@ -13,85 +13,27 @@ fitted iteration on Xw every sweep is a regression: a hard target network whose 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neuralq.checks import check_whole
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.chains import chain_of, greedy_policy, pairs_of
-from neuralq.lab.methods.method import Expected, Method, Options, Piece
-from neuralq.lab.methods.operators import covariance, cross, td
+from neuralq.lab.linear.sampling import SampledTransition
+from neuralq.lab.methods.chains import Chain, chain_of, greedy_policy, pairs_of
+from neuralq.lab.methods.method import LAMBDA, RIDGE, Expected, Method, Options, Piece
+from neuralq.lab.methods.operators import ahead, covariance, cross, td
 from neuralq.lab.methods.trace import Trace
 from neuralq.types import Floats
 
-__all__ = ["BRM", "FITTED", "FITTED_Q", "LSPI", "LSTD", "PolicyIteration", "lspi"]
+__all__ = ["BRM", "FITTED", "FITTED_Q", "LSPI", "LSTD"]
 
 NEGLIGIBLE = 1e-10
 """Singular values below this share of the largest count as 0 in a pseudo-inverse."""
 
 
-@dataclass(frozen=True, eq=False)
-class PolicyIteration:
-    """Where least-squares policy iteration went.
-
-    Args:
-        weights: the first weights and those after every evaluation, ``[K + 1, d]``.
-        policies: the greedy action of every state at each of them, ``[K + 1, S]``.
-        cycle: 1 where the last policy repeats for ever (it converged), a larger number where the last so many policies
-            repeat in turn, 0 where neither was seen within the iterations allowed.
-    """
-
-    weights: Floats
-    policies: NDArray[np.int64]
-    cycle: int
-
-
-def lspi(process: Process, w0: Floats, num_iterations: int = 100) -> PolicyIteration:
-    """Policy iteration whose evaluation is LSTD on the process's own features and update distribution.
-
-    Args:
-        process: of pairs.
-        w0: ``[d]``; the first policy is greedy in it.
-        num_iterations: at most so many evaluations.
-
-    Raises:
-        ValueError: rows are states.
-
-    Source: Lagoudakis & Parr 2003.
-
-    Example:
-        >>> from neuralq.lab.linear.process import linear_process
-        >>> from neuralq.mdp import FiniteMDP
-        >>> from neuralq_envs.counterexamples import Problem
-        >>> mdp = FiniteMDP.garnet(5, 2, 2, seed=0)
-        >>> table = np.eye(10).reshape(5, 2, 10)
-        >>> lspi(linear_process(Problem.from_mdp(mdp, table, gamma=0.9)), np.zeros(10)).cycle  # a table converges
-        1
-    """
-    row_of = pairs_of(process, "lspi")
-    check_whole("num_iterations", num_iterations)
-    weights: list[Floats] = [w0.copy()]
-    policies: list[NDArray[np.int64]] = []
-    seen: dict[bytes, int] = {}
-    for k in range(num_iterations + 1):
-        policy = greedy_policy(process, row_of, weights[-1])
-        policies.append(policy.argmax(axis=1))
-        key = policies[-1].tobytes()
-        if key in seen:
-            return PolicyIteration(np.array(weights), np.array(policies), k - seen[key])
-        seen[key] = k
-        if k < num_iterations:
-            weights.append(_solution(process, chain_of(process, row_of, policy)))
-    return PolicyIteration(np.array(weights), np.array(policies), 0)
-
-
 class _Solver:
     """Sums of left (x − γx')ᵀ and of left r for every seed, solved when the weights are asked for."""
 
-    def __init__(self, w0: Floats, eta: float, left: Callable[[Sample], Floats]) -> None:
+    def __init__(self, w0: Floats, eta: float, left: Callable[[SampledTransition], Floats]) -> None:
         self._left = left
         num_seeds, d = w0.shape
         self._matrix = np.zeros((num_seeds, d, d))
@@ -99,7 +41,7 @@ class _Solver:
         self._eta, self._count = eta, 0
         self._theta, self._stale = w0.copy(), False
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         left, right = self._left(sample), sample.x - sample.discount[:, None] * sample.x_next
         self._matrix += left[:, :, None] * right[:, None, :]
         self._vector += sample.reward[:, None] * left
@@ -123,13 +65,13 @@ class _Solver:
 
 def _lstd(process: Process, w0: Floats, options: Options) -> _Solver:
     trace = Trace(w0.shape, options["lambda_"])
-    return _Solver(w0, options["eta"], lambda sample: trace.follow(sample, sample.rho))
+    return _Solver(w0, options["eta"], lambda sample: trace.advance(sample, sample.rho))
 
 
 def _brm(process: Process, w0: Floats, options: Options) -> _Solver:
-    def back(sample: Sample) -> Floats:
-        ahead = sample.discount_second[:, None] * sample.x_second
-        return np.asarray(sample.rho[:, None] * (sample.x - ahead))
+    def back(sample: SampledTransition) -> Floats:
+        second = sample.discount_second[:, None] * sample.x_second
+        return np.asarray(sample.rho[:, None] * (sample.x - second))
 
     return _Solver(w0, options["eta"], back)
 
@@ -138,11 +80,10 @@ def _pinv(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.pinv(matrix, rcond=NEGLIGIBLE))
 
 
-def _solution(process: Process, P: Floats | object) -> Floats:
+def _solution(process: Process, P: Chain) -> Floats:
     """The LSTD(0) weights for another chain."""
-    ahead = process.X - process.gamma * (P @ process.X)  # type: ignore[operator]
     back = process.D[:, None] * process.X
-    weights: Floats = _pinv(back.T @ ahead) @ (back.T @ process.r)
+    weights: Floats = _pinv(back.T @ (process.X - process.gamma * (P @ process.X))) @ (back.T @ process.r)
     return weights
 
 
@@ -157,9 +98,9 @@ def _expected_lstd(process: Process, options: Options) -> Expected:
 
 
 def _expected_brm(process: Process, options: Options) -> Expected:
-    ahead = process.X - process.gamma * (process.P @ process.X)
-    back = process.D[:, None] * ahead
-    return _constant(_pinv(back.T @ ahead + options["eta"] * np.eye(process.num_weights)) @ (back.T @ process.r))
+    difference = ahead(process)
+    back = process.D[:, None] * difference
+    return _constant(_pinv(back.T @ difference + options["eta"] * np.eye(process.num_weights)) @ (back.T @ process.r))
 
 
 def _regression(process: Process, eta: float) -> Floats:
@@ -195,24 +136,25 @@ def _expected_lspi(process: Process, options: Options) -> Expected:
 
 
 LSTD = Method(
-    "lstd", "LSTD(λ)", "Bradtke & Barto 1996; Boyan 2002; off-policy Yu 2010", {"lambda_": 0.0, "eta": 0.0},
+    "lstd", "LSTD(λ)", "Bradtke & Barto 1996; Boyan 2002; off-policy Yu 2010", {"lambda_": LAMBDA, "eta": RIDGE},
     _expected_lstd, _lstd, remembers=lambda options: True,
-    note="has no step size; its sampled weights solve the averages of all transitions so far, plus η",
+    note="has no step size; its sampled weights solve the averages of all transitions so far, plus η", place=70,
 )  # fmt: skip
 BRM = Method(
     "brm", "Bellman residual minimisation", "Schweitzer & Seidmann 1985; Baird 1995; Lagoudakis & Parr 2003",
-    {"eta": 0.0}, _expected_brm, _brm, remembers=lambda options: True,
-    note="has no step size; needs two independent successors",
+    {"eta": RIDGE}, _expected_brm, _brm, remembers=lambda options: True,
+    note="has no step size; needs two independent successors", place=71,
 )  # fmt: skip
 FITTED = Method(
     "fitted", "fitted iteration, least squares", "Gordon 1995; Tsitsiklis & Van Roy 1996",
-    {"eta": 0.0}, _expected_fitted, None, note="has no step size: one sweep is one regression",
+    {"eta": RIDGE}, _expected_fitted, None, note="has no step size: one sweep is one regression", place=72,
 )  # fmt: skip
 FITTED_Q = Method(
-    "fitted-q", "fitted Q iteration, least squares", "Gordon 1995; Ernst, Geurts & Wehenkel 2005", {"eta": 0.0},
+    "fitted-q", "fitted Q iteration, least squares", "Gordon 1995; Ernst, Geurts & Wehenkel 2005", {"eta": RIDGE},
     _expected_fitted_q, None, rows="pairs", note="backs up the greedy action: piecewise linear, and has no step size",
+    place=73,
 )  # fmt: skip
 LSPI = Method(
     "lspi", "LSPI", "Lagoudakis & Parr 2003", {}, _expected_lspi, None, rows="pairs",
-    note="one sweep is one evaluation and one improvement; it may cycle among policies",
+    note="one sweep is one evaluation and one improvement; it may cycle among policies", place=74,
 )  # fmt: skip

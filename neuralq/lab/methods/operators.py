@@ -6,16 +6,26 @@ C = Xᵀ D X,    H = γ Xᵀ D P X,    A = C − H
 
 from __future__ import annotations
 
+import numpy as np
+
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
+from neuralq.lab.methods.chains import Chain, solve_chain
+from neuralq.lab.methods.method import Expected, flow
 from neuralq.types import Floats
 
-__all__ = ["covariance", "cross", "naive_residual", "td"]
+__all__ = ["ahead", "covariance", "cross", "td", "traced_flow"]
 
 
 def td(process: Process, lambda_: float = 0.0) -> tuple[Floats, Floats]:
     """A_λ ``[d, d]`` and b_λ ``[d]`` of the target policy."""
     return td_operator(process.P, process.r, process.X, process.D, process.gamma, lambda_)
+
+
+def ahead(process: Process, phi: float = 1.0) -> Floats:
+    """X − φγPX, ``[n, d]``: what a row shows less what follows it."""
+    difference: Floats = process.X - phi * process.gamma * (process.P @ process.X)
+    return difference
 
 
 def covariance(process: Process) -> Floats:
@@ -29,13 +39,19 @@ def cross(process: Process) -> Floats:
     return product
 
 
-def naive_residual(process: Process) -> tuple[Floats, Floats]:
-    """E[ρ (x − γx')(x − γx')ᵀ] and E[ρ r (x − γx')]: half the gradient of the mean square TD error."""
-    arcs = process.arcs
-    after = process.X[arcs.next_row]
-    after[arcs.next_row < 0] = 0.0
-    back = process.X[arcs.row] - arcs.discount[:, None] * after
-    weight = (process.D[arcs.row] * arcs.probability * arcs.rho)[:, None]
-    matrix: Floats = back.T @ (weight * back)
-    vector: Floats = back.T @ (weight[:, 0] * arcs.reward)
-    return matrix, vector
+def traced_flow(
+    process: Process, weight: Floats, chain: Chain, discount: float, difference: Floats, reward: Floats
+) -> Expected:
+    """The flow with G = Xᵀ diag(weight) (I − discount · chain)⁻¹ difference, and g likewise of the reward.
+
+    Args:
+        process: the problem.
+        weight: how often each row is updated, ``[n]``.
+        chain: along which errors are traced, ``[n, n]``.
+        discount: of a step along it.
+        difference: of features, ``[n, d]``.
+        reward: ``[n]``.
+    """
+    traced = solve_chain(chain, discount, np.column_stack([difference, reward]))
+    both = process.X.T @ (weight[:, None] * traced)
+    return flow(both[:, :-1], both[:, -1])

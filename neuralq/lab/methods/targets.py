@@ -19,12 +19,14 @@ method is linear only while nothing leaves the balls; the piece returned is exac
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from neuralq.checks import check_positive, check_whole
+from neuralq.checks import check_whole
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import Sample
-from neuralq.lab.methods.method import Expected, Method, Options, Piece
+from neuralq.lab.linear.sampling import SampledTransition
+from neuralq.lab.methods.method import LARGEST, RIDGE, Expected, Method, Option, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross
 from neuralq.types import Floats
 
@@ -67,12 +69,11 @@ class _Hard:
         self.theta = w0.copy()
         self._target, self._age = w0.copy(), 0
         self._period, self._eta = int(options["period"]), options["eta"]
-        check_whole("period", options["period"])  # type: ignore[arg-type]
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         if self._age % self._period == 0:
             self._target = self.theta.copy()
-        self.theta += step_size * _pull(self.theta, self._target, sample, self._eta)
+        self.theta += step_size * _direction(self.theta, self._target, sample, self._eta)
         self._age += 1
 
 
@@ -80,36 +81,35 @@ class _Polyak:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta = np.concatenate([w0, w0], axis=1)
         self._d, self._tau, self._eta = w0.shape[1], options["tau"], options["eta"]
-        _check_tau(self._tau)
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w, u = self.theta[:, : self._d], self.theta[:, self._d :]
-        pull = _pull(w, u, sample, self._eta)
+        change = _direction(w, u, sample, self._eta)
         u += self._tau * (w - u)
-        w += step_size * pull
+        w += step_size * change
 
 
 class _Projected:
     def __init__(self, process: Process, w0: Floats, options: Options) -> None:
         self.theta = np.concatenate([w0, w0], axis=1)
         self._d, self._tau, self._eta = w0.shape[1], options["tau"], options["eta"]
-        self._ball_w, self._ball_u = _balls(options)
+        self._ball_w, self._ball_u = options["ball_w"], options["ball_u"]
 
-    def update(self, sample: Sample, step_size: float) -> None:
+    def update(self, sample: SampledTransition, step_size: float) -> None:
         w, u = self.theta[:, : self._d], self.theta[:, self._d :]
-        pull = _pull(w, u, sample, self._eta)
+        change = _direction(w, u, sample, self._eta)
         shrunk = w * _shrink(w, self._ball_w)
         moved = u + self._tau * (shrunk - u)
         u[:] = moved * _shrink(moved, self._ball_u)
-        w += step_size * pull
+        w += step_size * change
 
 
-def _pull(w: Floats, u: Floats, sample: Sample, eta: float) -> Floats:
+def _direction(w: Floats, u: Floats, sample: SampledTransition, eta: float) -> Floats:
     """ρ (r + γ u·x' − w·x) x − η w of every seed."""
     target = sample.reward + sample.discount * np.einsum("nd,nd->n", u, sample.x_next)
     error = sample.rho * (target - np.einsum("nd,nd->n", w, sample.x))
-    pull: Floats = error[:, None] * sample.x - eta * w
-    return pull
+    change: Floats = error[:, None] * sample.x - eta * w
+    return change
 
 
 def _shrink(points: Floats, radius: float) -> Floats:
@@ -119,18 +119,6 @@ def _shrink(points: Floats, radius: float) -> Floats:
     return factor
 
 
-def _check_tau(tau: float) -> None:
-    if not 0 < tau <= 1:
-        raise ValueError(f"tau must lie in (0, 1], got {tau!r}; a target that never moves is tau=0")
-
-
-def _balls(options: Options) -> tuple[float, float]:
-    _check_tau(options["tau"])
-    for name in ("ball_w", "ball_u"):
-        check_positive(name, options[name])
-    return options["ball_w"], options["ball_u"]
-
-
 def _parts(process: Process, options: Options) -> tuple[Floats, Floats, Floats]:
     """C + ηI, H and b."""
     C = covariance(process) + options["eta"] * np.eye(process.num_weights)
@@ -138,7 +126,6 @@ def _parts(process: Process, options: Options) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected_hard(process: Process, options: Options) -> Expected:
-    check_whole("period", options["period"])  # type: ignore[arg-type]
     period, (C, H, b) = int(options["period"]), _parts(process, options)
     return Expected(
         len(b), lambda theta, step_size: frozen_target_map(C, H, b, step_size, period), updates_per_sweep=period
@@ -166,13 +153,12 @@ def _doubled(w0: Floats) -> Floats:
 
 
 def _expected_polyak(process: Process, options: Options) -> Expected:
-    _check_tau(options["tau"])
     update = _WithTarget(process, options)
     return Expected(2 * process.num_weights, lambda theta, step_size: update.at(step_size), start=_doubled)
 
 
 def _expected_projected(process: Process, options: Options) -> Expected:
-    ball_w, ball_u = _balls(options)
+    ball_w, ball_u = options["ball_w"], options["ball_u"]
     d, tau, update = process.num_weights, options["tau"], _WithTarget(process, options)
 
     def at(theta: Floats, step_size: float) -> Piece:
@@ -184,17 +170,22 @@ def _expected_projected(process: Process, options: Options) -> Expected:
     return Expected(2 * d, at, linear=False, start=_doubled)
 
 
+_TAU = Option(0.01, 1e-4, 1.0, "τ, averaging", "log")
 HARD_TARGET = Method(
     "hard-target", "TD with a target network, copied", "Mnih et al. 2015; Fellows, Smith & Whiteson 2023",
-    {"period": 100.0, "eta": 0.0}, _expected_hard, _Hard, remembers=lambda options: options["period"] > 1,
-    note="one sweep of the expected update stands for a whole period",
+    {"period": Option(100.0, 1, 1024, "period of the copy", "whole", most=1e9), "eta": RIDGE}, _expected_hard, _Hard,
+    remembers=lambda options: options["period"] > 1,
+    note="one sweep of the expected update stands for a whole period", place=60,
 )  # fmt: skip
 POLYAK_TARGET = Method(
     "polyak-target", "TD with a target network, averaged", "Lillicrap et al. 2016",
-    {"tau": 0.01, "eta": 0.0}, _expected_polyak, _Polyak,
+    {"tau": _TAU, "eta": RIDGE}, _expected_polyak, _Polyak, place=61,
 )  # fmt: skip
 PROJECTED_TARGET = Method(
     "projected-target", "TD with a ridge and a projected target network", "Zhang, Yao & Whiteson 2021",
-    {"tau": 0.01, "eta": 0.1, "ball_w": 100.0, "ball_u": 200.0}, _expected_projected, _Projected,
-    note="linear only inside the balls; the limit is (A + ηI)⁻¹ b where that lies in them",
+    {"tau": _TAU, "eta": replace(RIDGE, default=0.1),
+     "ball_w": Option(100.0, 1.0, 1e3, "radius of the ball of w", "log", LARGEST),
+     "ball_u": Option(200.0, 1.0, 1e3, "radius of the ball of the target", "log", LARGEST)},
+    _expected_projected, _Projected,
+    note="linear only inside the balls; the limit is (A + ηI)⁻¹ b where that lies in them", place=62,
 )  # fmt: skip

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from neuralq.checks import check_positive
 from neuralq.exact import predict_expected_td
-from neuralq.lab.networks.expected import ExpectedBackup, QModule, expected_backup, local_jacobian
+from neuralq.lab.networks.expected import QModule, expected_backup, local_spectrum
 from neuralq.lab.networks.tangent_kernel import (
     LocalSystem,
     local_system,
@@ -206,7 +206,8 @@ def diagnose_network(
     kernel = predict_expected_td(reduced_operator(system, 1e-6 if single else 1e-12), alpha)
     num_parameters = system.jacobian.shape[1]
     curved = num_parameters <= _MOST_WEIGHTS if curvature is None else curvature
-    rate, growth = _full(q, backup, alpha, 1e-5 if single else 1e-10) if curved else (None, None)
+    moving = local_spectrum(q, backup, 1e-5 if single else 1e-10) if curved else None
+    growth = None if moving is None else float(np.abs(1 + alpha * moving).max(initial=0.0))
     factor, excess, small_step = _achiam(system, alpha)
     return NetworkDiagnosis(
         num_cells=len(system.weights),
@@ -225,7 +226,7 @@ def diagnose_network(
         achiam_factor=factor,
         achiam_excess=excess,
         growth=growth,
-        rate=rate,
+        rate=None if moving is None else float(moving.real.max()) if len(moving) else 0.0,
         largest_error=float(np.abs(system.errors).max(initial=0.0)),
         verdict=local_verdict(kernel.spectral_radius, growth),
     )
@@ -246,15 +247,6 @@ def _seen(q: QModule, problem: Problem, observations: Tensor | None) -> Tensor:
         observations = torch.arange(problem.mdp.num_states) if table else observations_of(problem)
     dtype = first.dtype if observations.dtype.is_floating_point else observations.dtype
     return observations.to(first.device, dtype)
-
-
-def _full(q: QModule, backup: ExpectedBackup, step_size: float, tolerance: float) -> tuple[float, float]:
-    """Largest real part of G's eigenvalues and the spectral radius of I + αG, without directions that do not matter."""
-    eigenvalues = np.linalg.eigvals(local_jacobian(q, backup))
-    moving = eigenvalues[np.abs(eigenvalues) > tolerance * np.abs(eigenvalues).max(initial=0.0)]
-    if len(moving) == 0:
-        return 0.0, 0.0
-    return float(moving.real.max()), float(np.abs(1 + step_size * moving).max())
 
 
 def _achiam(system: LocalSystem, step_size: float) -> tuple[float, float, bool]:

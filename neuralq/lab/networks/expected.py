@@ -29,9 +29,18 @@ from torch import Tensor, nn
 
 from neuralq.checks import check_positive
 from neuralq.exact import policy_process
+from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
-__all__ = ["ExpectedBackup", "QModule", "expected_backup", "expected_td_step", "local_growth", "local_jacobian"]
+__all__ = [
+    "ExpectedBackup",
+    "QModule",
+    "expected_backup",
+    "expected_td_step",
+    "local_growth",
+    "local_jacobian",
+    "local_spectrum",
+]
 
 QModule = nn.Module  # with `all` and `at`: a module that is a `neuralq.types.QFunction`
 
@@ -176,15 +185,15 @@ def expected_td_step(q: QModule, backup: ExpectedBackup, step_size: float) -> Te
     parameters = list(q.parameters())
     values: Tensor = q.all(backup.observations)  # type: ignore[operator]
     before = values.detach()
-    pull = backup.update_weights(before) * backup.errors(before)
-    directions = torch.autograd.grad(values, parameters, grad_outputs=pull)
+    weighted = backup.update_weights(before) * backup.errors(before)
+    directions = torch.autograd.grad(values, parameters, grad_outputs=weighted)
     with torch.no_grad():
         for parameter, direction in zip(parameters, directions, strict=True):
             parameter.add_(direction, alpha=step_size)
     return before
 
 
-def local_jacobian(q: QModule, backup: ExpectedBackup) -> NDArray[np.float64]:
+def local_jacobian(q: QModule, backup: ExpectedBackup) -> Floats:
     """G = ∂F/∂θ at the present weights, ``[p, p]``: how a small change of the weights changes the expected update.
 
     It is the whole derivative, G = −Jᵀ D (I − γP) J + Σ w δ ∇²Q, with J = ∂Q/∂θ and D = diag(w).
@@ -204,12 +213,12 @@ def local_jacobian(q: QModule, backup: ExpectedBackup) -> NDArray[np.float64]:
     values: Tensor = q.all(backup.observations)  # type: ignore[operator]
     # F keeps its graph through the errors as well as through ∇Q, so its derivative is the full one.
     wide = values.double()
-    pull = (backup.update_weights(wide.detach()) * backup.errors(wide)).to(values.dtype)
-    parts = torch.autograd.grad(values, parameters, grad_outputs=pull, create_graph=True)
+    weighted = (backup.update_weights(wide.detach()) * backup.errors(wide)).to(values.dtype)
+    parts = torch.autograd.grad(values, parameters, grad_outputs=weighted, create_graph=True)
     update = torch.cat([part.reshape(-1) for part in parts])
     rows = torch.autograd.grad(update, parameters, grad_outputs=torch.eye(len(update), dtype=update.dtype),
                                is_grads_batched=True, materialize_grads=True)  # fmt: skip
-    jacobian: NDArray[np.float64] = torch.cat([row.reshape(len(update), -1) for row in rows], dim=1).double().numpy()
+    jacobian: Floats = torch.cat([row.reshape(len(update), -1) for row in rows], dim=1).double().numpy()
     return jacobian
 
 
@@ -231,6 +240,11 @@ def local_growth(q: QModule, backup: ExpectedBackup, step_size: float) -> float:
         0.999
     """
     check_positive("step_size", step_size)
-    eigenvalues = np.linalg.eigvals(local_jacobian(q, backup))
-    moving = eigenvalues[np.abs(eigenvalues) > 1e-10 * np.abs(eigenvalues).max(initial=0.0)]
-    return float(np.abs(1 + step_size * moving).max(initial=0.0))
+    return float(np.abs(1 + step_size * local_spectrum(q, backup)).max(initial=0.0))
+
+
+def local_spectrum(q: QModule, backup: ExpectedBackup, tolerance: float = 1e-10) -> NDArray[np.complex128]:
+    """Eigenvalues of G, without the directions that nothing depends on: those below this share of the largest."""
+    eigenvalues = np.linalg.eigvals(local_jacobian(q, backup)).astype(np.complex128)
+    moving: NDArray[np.complex128] = eigenvalues[np.abs(eigenvalues) > tolerance * np.abs(eigenvalues).max(initial=0.0)]
+    return moving

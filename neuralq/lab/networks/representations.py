@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,8 +25,10 @@ from torch import Tensor, nn
 
 from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.exact import action_values, evaluate, predict_expected_td, rmsve, solve
+from neuralq.lab.linear.process import check_values
 from neuralq.lab.networks.expected import ExpectedBackup, QModule, expected_backup, expected_td_step, local_growth
 from neuralq.lab.networks.tangent_kernel import local_system, local_verdict, observations_of, reduced_operator
+from neuralq.lab.plain import fields_of
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, LinearQ, SeparateQ, TableQ
 from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
@@ -137,6 +139,11 @@ class RepresentationResult:
     exact_values: Floats
     kernel_growth: float
 
+    def plain(self) -> dict[str, Any]:
+        """Prediction and measurement, as JSON takes them."""
+        names = ("representation", "predicted_growth", "prediction_scope", "verdict", "measured_growth")
+        return fields_of(self, *names, "stopped_on_cap")
+
 
 def run_representations(
     problem: Problem,
@@ -212,6 +219,7 @@ def _checked(problem: Problem, step_size: float | None, seed: int, representatio
         check_choice("representations", name, REPRESENTATIONS)
     alpha = problem.step_size if step_size is None else step_size
     check_positive("step_size", alpha)
+    check_values(problem)
     if problem.value is not None and "linear" in representations:
         raise ValueError(
             f"the value function of {problem.name!r} is not linear in its parameters; leave 'linear' out of "

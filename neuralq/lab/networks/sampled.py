@@ -15,8 +15,8 @@ It is therefore a *local* alarm about one-step updates without a target network,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, cast
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from neuralq.checks import check_positive
 from neuralq.exact import Prediction, predict_expected_td
 from neuralq.lab.networks.expected import QModule
 from neuralq.lab.networks.tangent_kernel import value_jacobian
+from neuralq.lab.plain import plain
 from neuralq.types import Floats, Transition
 
 __all__ = ["SampleDiagnosis", "diagnose_sample"]
@@ -85,6 +86,10 @@ class SampleDiagnosis:
         if self.unstable:
             return "grows"
         return "step size too large" if self.too_large_step else "shrinks"
+
+    def plain(self) -> dict[str, Any]:
+        """The verdict and its numbers, as JSON takes them."""
+        return {"verdict": self.verdict, **plain(asdict(self))}
 
     def explain(self) -> str:
         """One paragraph for someone who watches a run."""

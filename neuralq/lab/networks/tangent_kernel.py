@@ -16,14 +16,13 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 
 from neuralq.lab.networks.expected import ExpectedBackup, QModule
-from neuralq.types import Floats
+from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem
 
 __all__ = [
     "LocalSystem",
     "local_system",
     "local_verdict",
-    "neural_tangent_kernel",
     "observations_of",
     "reduced_operator",
     "value_jacobian",
@@ -66,21 +65,6 @@ def value_jacobian(q: QModule, s: Tensor, a: Tensor) -> Tensor:
     return torch.cat([rows[name].reshape(len(s), -1) for name in parameters], dim=1)
 
 
-def neural_tangent_kernel(q: QModule, s: Tensor, a: Tensor) -> Floats:
-    """K = J Jᵀ of these values, in float64: ``([N, *obs], [N]) -> [N, N]``; K_ij says how much i moves when j is told.
-
-    Source: Jacot, Gabriel & Hongler 2018.
-
-    Example:
-        >>> from neuralq.q import TableQ
-        >>> neural_tangent_kernel(TableQ(3, 1), torch.arange(3), torch.zeros(3, dtype=torch.int64)).tolist()
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    jacobian = value_jacobian(q, s, a).double()
-    kernel: Floats = (jacobian @ jacobian.T).cpu().numpy()
-    return kernel
-
-
 def observations_of(problem: Problem, kind: Literal["features", "states"] = "features") -> Tensor:
     """What a network sees of each state: the problem's features, ``[S, d]``, or which state it is, one-hot ``[S, S]``.
 
@@ -119,8 +103,8 @@ class LocalSystem:
         gamma: γ.
     """
 
-    states: NDArray[np.int64]
-    actions: NDArray[np.int64]
+    states: Indices
+    actions: Indices
     jacobian: Floats
     weights: Floats
     transitions: Floats

@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
@@ -26,6 +27,7 @@ from neuralq.lab.linear.spectrum import flow_spectrum, moving_spectrum, visible_
 from neuralq.lab.methods import Method
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.method import Options
+from neuralq.lab.plain import fields_of
 from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
 
@@ -94,16 +96,37 @@ class StabilityScan:
     boundaries: tuple[float, ...]
 
     @property
+    def intervals(self) -> tuple[tuple[float, float, bool], ...]:
+        """The whole range as ``(from, to, whether it is stable)``."""
+        edges = [float(self.values[0]), *self.boundaries, float(self.values[-1])]
+        first = bool(self.margins[0] > 0)
+        return tuple((low, high, first == (k % 2 == 0)) for k, (low, high) in enumerate(itertools.pairwise(edges)))
+
+    @property
     def stable(self) -> tuple[tuple[float, float], ...]:
         """The stable set as intervals ``(from, to)``."""
-        edges = [self.values[0], *self.boundaries, self.values[-1]]
-        inside = bool(self.margins[0] > 0)
-        kept = []
-        for low, high in itertools.pairwise(edges):
-            if inside:
-                kept.append((float(low), float(high)))
-            inside = not inside
-        return tuple(kept)
+        return tuple((low, high) for low, high, inside in self.intervals if inside)
+
+    def first(self) -> float:
+        """The first boundary from below.
+
+        Raises:
+            NoBoundary: nothing changes over the whole range; the message says what holds.
+        """
+        if self.boundaries:
+            return self.boundaries[0]
+        raise NoBoundary(
+            f"{self.method} on {self.problem} is {'stable' if self.margins[0] > 0 else 'unstable'} for every "
+            f"{self.parameter} from {self.values[0]:g} to {self.values[-1]:g}: there is no critical value"
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """Everything as text and numbers, as JSON takes it."""
+        return {
+            **fields_of(self, "problem", "method", "parameter", "step_size", "boundaries", "stable"),
+            "critical": self.boundaries[0] if self.boundaries else None,
+            "range": [float(self.values[0]), float(self.values[-1])],
+        }
 
 
 def critical(
@@ -131,14 +154,7 @@ def critical(
         >>> round(critical(star(), "gamma"), 10) == round(15 / 17, 10)
         True
     """
-    found = scan(problem, parameter, method, step_size, None, **options)
-    if not found.boundaries:
-        what = "stable" if found.margins[0] > 0 else "unstable"
-        raise NoBoundary(
-            f"{found.method} on {problem.name} is {what} for every {parameter} from {found.values[0]:g} to "
-            f"{found.values[-1]:g}: there is no critical value"
-        )
-    return found.boundaries[0]
+    return scan(problem, parameter, method, step_size, None, **options).first()
 
 
 def scan(
@@ -204,7 +220,7 @@ def stability_margin(problem: Problem, chosen: Method, step_size: float | None =
         ValueError: the method has no expected update, or one that changes with the weights.
 
     Example:
-        >>> from neuralq.lab.methods import TD
+        >>> from neuralq.lab.methods.td import TD
         >>> from neuralq_envs.counterexamples import star
         >>> round(stability_margin(star(), TD), 9)  # the eigenvalue behind the divergence of the star
         -0.239250464

@@ -34,7 +34,6 @@ from neuralq.lab.linear.spectrum import (
 )
 from neuralq.lab.methods import Expected, Method, flow
 from neuralq.lab.methods import method as method_named
-from neuralq.lab.methods.emphatic import AS_GAMMA, ETD, follow_on_second_moment
 from neuralq.lab.methods.method import Options
 from neuralq.lab.verdicts.moments import (
     growth_factors,
@@ -44,7 +43,7 @@ from neuralq.lab.verdicts.moments import (
     unknowns,
 )
 from neuralq.lab.verdicts.piecewise import follow
-from neuralq.lab.verdicts.update_maps import Jumps, jumps
+from neuralq.lab.verdicts.update_maps import UpdateMaps, update_maps
 from neuralq.lab.verdicts.words import Diagnosis, Verdict, is_poor
 from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem
@@ -160,9 +159,8 @@ def _linear(case: _Case) -> Diagnosis:
     rank, second, second_bound = len(factors), None, None
     if case.memoryless:
         factors, second, bound, second_bound = _moments(case, factors, bound)
-    elif case.method is ETD and case.sampling == "markov":
-        beta = case.options["beta"]
-        second = follow_on_second_moment(case.process, None if beta == AS_GAMMA else beta)
+    elif case.method.memory_growth is not None and case.sampling == "markov":
+        second = case.method.memory_growth(case.process, case.options)
     factors = factors[np.argsort(-np.abs(factors), kind="stable")]
     radius = float(np.abs(factors[0])) if len(factors) else 0.0
     drift = float(np.linalg.norm(limit.drift)) * (alpha if expected.generator is not None else 1.0)
@@ -185,8 +183,8 @@ def _moments(case: _Case, factors: Factors, bound: float) -> tuple[Factors, floa
     """Factors of the mean, radius of the second moment, and the step-size bounds of both."""
     sampling = case.sampling
 
-    def at(step_size: float) -> Jumps:
-        return jumps(case.process, case.method, case.options, step_size)
+    def at(step_size: float) -> UpdateMaps:
+        return update_maps(case.process, case.method, case.options, step_size)
 
     maps = at(case.alpha)
     second = second_moment_radius(maps, sampling)

@@ -1,7 +1,7 @@
 """Exact mean and second moment of a sampled method, from the affine maps of single transitions.
 
-Along arc k a memoryless method changes θ ← M_k θ + c_k, exactly; M_k and c_k are read off the learner itself, run on 0
-and on the unit vectors. With independent draws (row i with chance D_i, then an arc of it)
+Along transition k a memoryless method changes θ ← M_k θ + c_k, exactly; M_k and c_k are read off the learner itself,
+run on 0 and on the unit vectors. With independent draws (row i with chance D_i, then a transition of it)
 
     E θ     ← E[M] E θ + E[c]
     E θθᵀ   ← E[M θθᵀ Mᵀ] + ...,             grows by the spectral radius of E[M ⊗ M]
@@ -11,10 +11,10 @@ system; Costa, Fragoso & Marques 2005, chapter 3), n·q unknowns for the mean an
 
     m_j ← Σ_{k: i→j} p_k M_k m_i,            V_j ← Σ_{k: i→j} p_k M_k V_i M_kᵀ
 
-where arcs that end an episode lead to the start distribution. Radii are taken on what the maps move, the range of all
-M_k − I; along a chain within each class of rows that can reach each other, for the radius of the whole is the largest
-of theirs. V keeps being symmetric and positive, so q(q+1)/2 numbers per row suffice, and the growth is that of a
-positive operator L. So stability is certain without eigenvalues: it is stable iff V − L V = I has a positive solution.
+where transitions that end an episode lead to the start distribution. Radii are taken on what the maps move, the range
+of all M_k − I; along a chain within each class of rows that can reach each other, for the radius of the whole is the
+largest of theirs. V keeps being symmetric and positive, so q(q+1)/2 numbers per row suffice, and the growth is that of
+a positive operator L. So stability is certain without eigenvalues: it holds iff V − L V = I has a positive solution.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 
-from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.spectrum import moving_space
-from neuralq.lab.verdicts.update_maps import Jumps, jumps
+from neuralq.lab.linear.process import Process, linear_process
+from neuralq.lab.linear.spectrum import moving_space, visible_process
+from neuralq.lab.methods import Method
+from neuralq.lab.methods.method import Options
+from neuralq.lab.verdicts.update_maps import UpdateMaps, update_maps
 from neuralq.types import Floats, Indices
+from neuralq_envs.counterexamples import Problem
 
 __all__ = [
-    "Jumps",
     "evolve",
     "growth_factors",
-    "jumps",
+    "known_second_moment",
     "mean_radius",
     "second_moment_radius",
     "second_moment_stable",
-    "steady_covariance",
     "unknowns",
 ]
 
@@ -57,7 +58,7 @@ def unknowns(process: Process, size: int, sampling: str) -> int:
     return size * size * (process.num_rows if sampling == "markov" else 1)
 
 
-def mean_radius(maps: Jumps, sampling: str) -> float:
+def mean_radius(maps: UpdateMaps, sampling: str) -> float:
     """The growth per step of the mean of θ, on what the maps move; 0 where they move nothing.
 
     Independent draws give that of the expected update; along one chain it differs in second order of α.
@@ -67,18 +68,18 @@ def mean_radius(maps: Jumps, sampling: str) -> float:
         sampling: ``"iid"`` or ``"markov"``.
 
     Example:
-        >>> from neuralq.lab.verdicts.update_maps import jumps
-        >>> from neuralq.lab.methods import TD
+        >>> from neuralq.lab.verdicts.update_maps import update_maps
+        >>> from neuralq.lab.methods.td import TD
         >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
-        >>> maps = jumps(linear_process(star()), TD, TD.checked({}), 0.01)
+        >>> maps = update_maps(linear_process(star()), TD, TD.checked({}), 0.01)
         >>> round(mean_radius(maps, "iid"), 7), round(mean_radius(maps, "markov"), 7)  # Sutton & Barto 2018, 11.2
         (1.0023925, 1.0023814)
     """
     return float(np.abs(growth_factors(maps, sampling)).max(initial=0.0))
 
 
-def growth_factors(maps: Jumps, sampling: str) -> NDArray[np.complex128]:
+def growth_factors(maps: UpdateMaps, sampling: str) -> NDArray[np.complex128]:
     """The factors per step of the mean of θ, largest modulus first; along large chains the leading ones only."""
     found = [np.zeros(0, dtype=np.complex128)]
     for part in _classes(maps, sampling):
@@ -90,7 +91,7 @@ def growth_factors(maps: Jumps, sampling: str) -> NDArray[np.complex128]:
     return every[np.argsort(-np.abs(every), kind="stable")]
 
 
-def second_moment_radius(maps: Jumps, sampling: str) -> float:
+def second_moment_radius(maps: UpdateMaps, sampling: str) -> float:
     """The growth per step of E θθᵀ, on what the maps move; below 1 the variance settles, above it explodes.
 
     Args:
@@ -98,11 +99,11 @@ def second_moment_radius(maps: Jumps, sampling: str) -> float:
         sampling: ``"iid"`` or ``"markov"``.
 
     Example:
-        >>> from neuralq.lab.verdicts.update_maps import jumps
-        >>> from neuralq.lab.methods import TD
+        >>> from neuralq.lab.verdicts.update_maps import update_maps
+        >>> from neuralq.lab.methods.td import TD
         >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
-        >>> maps = jumps(linear_process(star()), TD, TD.checked({}), 0.01)
+        >>> maps = update_maps(linear_process(star()), TD, TD.checked({}), 0.01)
         >>> round(second_moment_radius(maps, "iid"), 7), round(second_moment_radius(maps, "markov"), 7)
         (1.0048556, 1.004811)
     """
@@ -110,7 +111,7 @@ def second_moment_radius(maps: Jumps, sampling: str) -> float:
     return max((float(np.abs(_leading(part, 2)).max(initial=0.0)) for part in parts), default=0.0)
 
 
-def second_moment_stable(maps: Jumps, sampling: str) -> bool:
+def second_moment_stable(maps: UpdateMaps, sampling: str) -> bool:
     """Whether the second moment settles, by a linear system where that is cheaper than eigenvalues.
 
     L maps positive matrices to such, so its radius is below 1 iff V − L V = I has a positive definite solution.
@@ -132,81 +133,62 @@ def second_moment_stable(maps: Jumps, sampling: str) -> bool:
     return True
 
 
-def steady_covariance(maps: Jumps) -> tuple[Floats, Floats]:
-    """The mean ``[size]`` and covariance ``[size, size]`` of θ in the long run of independent draws.
-
-    Directions that nothing moves keep their initial 0. Σ = E[M Σ Mᵀ] + E[e eᵀ], e = M m + c − m.
-
-    Raises:
-        ValueError: the second moment does not settle.
-
-    Example:
-        >>> from neuralq.lab.verdicts.update_maps import Jumps
-        >>> one = np.ones((2, 1, 1))  # θ ← θ/2 ± 1 by a coin: variance 1 / (1 − 1/4)
-        >>> coin = Jumps(one / 2, np.array([[1.0], [-1.0]]), np.zeros(2, int), np.zeros(2, int), np.full(2, 0.5),
-        ...              np.ones(1), np.ones(1))
-        >>> round(float(steady_covariance(coin)[1][0, 0]), 12)
-        1.333333333333
-    """
-    kept = maps.weight > 0
-    V = _moved(maps, kept)
-    if not second_moment_stable(maps, "iid"):
-        raise ValueError(
-            "the second moment grows without bound: there is no steady covariance; use a smaller step size"
-        )
-    part, weight, c = maps.within(kept, V), maps.weight[kept], maps.c[kept] @ V
-    q = V.shape[1]
-    M, mean_c = np.einsum("k,kij->ij", weight, part.M), weight @ c
-    m = np.linalg.solve(np.eye(q) - M, mean_c)
-    e = part.M @ m + c - m
-    noise = np.einsum("k,ki,kj->ij", weight, e, e)
-    L = np.einsum("k,kia,kjb->ijab", weight, part.M, part.M, optimize=True).reshape(q * q, q * q)
-    covariance = np.linalg.solve(np.eye(q * q) - L, noise.reshape(-1)).reshape(q, q)
-    return V @ m, V @ covariance @ V.T
-
-
-def evolve(maps: Jumps, theta: Floats, num_steps: int, sampling: str) -> tuple[Floats, Floats]:
-    """The exact mean ``[size]`` and covariance ``[size, size]`` of θ after some sampled updates from a given start.
+def evolve(maps: UpdateMaps, theta: Floats, steps: Indices, sampling: str = "markov") -> tuple[Floats, Floats]:
+    """The exact E θ ``[R, size]`` and E θθᵀ ``[R, size, size]`` after given numbers of sampled updates from a start.
 
     Args:
         maps: from `neuralq.lab.verdicts.update_maps`.
         theta: where every seed starts, ``[size]``.
-        num_steps: updates.
+        steps: numbers of updates, rising, ``[R]``.
         sampling: ``"iid"`` or ``"markov"``; a chain begins at a row drawn from D.
 
     Example:
-        >>> from neuralq.lab.verdicts.update_maps import Jumps
         >>> one = np.ones((2, 1, 1))
-        >>> coin = Jumps(one, np.array([[1.0], [-1.0]]), np.zeros(2, int), np.zeros(2, int), np.full(2, 0.5),
-        ...              np.ones(1), np.ones(1))
-        >>> evolve(coin, np.zeros(1), 7, "iid")[1].round(12).tolist()  # a random walk
-        [[7.0]]
+        >>> coin = UpdateMaps(one, np.array([[1.0], [-1.0]]), np.zeros(2, int), np.zeros(2, int), np.full(2, 0.5),
+        ...                   np.ones(1), np.ones(1))
+        >>> evolve(coin, np.zeros(1), np.array([7]), "iid")[1].round(12).tolist()  # a random walk
+        [[[7.0]]]
     """
     size = len(theta)
     M = np.zeros((len(maps.M), size + 1, size + 1))  # of (θ, 1), so that constants are part of the map
     M[:, :size, :size], M[:, :size, size], M[:, size, size] = maps.M, maps.c, 1.0
     both = np.append(theta, 1.0)
     V = maps.D[:, None, None] * np.outer(both, both)
-    arrive = _arrivals(maps, np.arange(maps.num_rows))
-    for _ in range(num_steps):
-        moved = maps.probability[:, None, None] * (M @ V[maps.row] @ np.swapaxes(M, 1, 2))
-        if sampling == "iid":
-            V = maps.D[:, None, None] * moved.sum(axis=0)
-        else:
-            V = (arrive @ moved.reshape(len(M), -1)).reshape(V.shape)
-    second = V.sum(axis=0)
-    mean = second[:size, size]
-    return mean, second[:size, :size] - np.outer(mean, mean)
+    if sampling == "iid":
+        arrive = np.outer(maps.D, maps.probability)
+    else:
+        arrive = _arrivals(maps, np.arange(maps.num_rows)).toarray() * maps.probability
+    found, wanted = [], set(steps.tolist())
+    for step in range(int(steps[-1]) + 1):
+        if step in wanted:
+            found.append(V.sum(axis=0))
+        moved = M @ V[maps.row] @ np.swapaxes(M, 1, 2)
+        V = (arrive @ moved.reshape(len(M), -1)).reshape(V.shape)
+    total = np.array(found)
+    return total[:, :size, size], total[:, :size, :size]
 
 
-def _moved(maps: Jumps, kept: NDArray[np.bool_]) -> Floats:
-    """A basis of all that these arcs move."""
+def known_second_moment(
+    problem: Problem, method: Method, options: Options, step_size: float, sampling: str, most: int = 5_000
+) -> float | None:
+    """`second_moment_radius` of a method on a problem; None where updates are no random maps, or too many unknowns."""
+    process, _ = visible_process(linear_process(problem))
+    expected = None if method.expected is None else method.expected(process, options)
+    if expected is None or not expected.linear or method.learner is None or method.remembers(options):
+        return None
+    if unknowns(process, expected.size, sampling) > most:
+        return None
+    return second_moment_radius(update_maps(process, method, options, step_size), sampling)
+
+
+def _moved(maps: UpdateMaps, kept: NDArray[np.bool_]) -> Floats:
+    """A basis of all that these transitions move."""
     size = maps.M.shape[1]
     change = np.swapaxes(maps.M[kept] - np.eye(size), 0, 1)
     return moving_space(change.reshape(size, -1)) if kept.any() and size else np.zeros((size, 0))
 
 
-def _classes(maps: Jumps, sampling: str) -> Iterator[Jumps]:
+def _classes(maps: UpdateMaps, sampling: str) -> Iterator[UpdateMaps]:
     """The parts whose radii decide, each on what it moves: everything at once, or the classes of a chain."""
     for kept in _parts(maps, sampling):
         V = _moved(maps, kept)
@@ -214,7 +196,7 @@ def _classes(maps: Jumps, sampling: str) -> Iterator[Jumps]:
             yield maps.within(kept, V)
 
 
-def _parts(maps: Jumps, sampling: str) -> list[NDArray[np.bool_]]:
+def _parts(maps: UpdateMaps, sampling: str) -> list[NDArray[np.bool_]]:
     if sampling == "iid":
         return [maps.weight > 0]
     n = maps.num_rows
@@ -235,8 +217,8 @@ def _parts(maps: Jumps, sampling: str) -> list[NDArray[np.bool_]]:
     return parts
 
 
-def _arrivals(maps: Jumps, rows: Indices) -> sparse.csr_array:
-    """Where each arc leads, ``[len(rows), K]``: to one row, or, after an end, to every row as its start chance says."""
+def _arrivals(maps: UpdateMaps, rows: Indices) -> sparse.csr_array:
+    """Where each transition leads, ``[len(rows), K]``: to one row, or, after an end, to each by its start chance."""
     number = np.full(maps.num_rows + 1, -1, dtype=np.int64)
     number[rows] = np.arange(len(rows))
     goes = np.flatnonzero(number[maps.next_row] >= 0)  # -1 looks at the last entry, which is no row
@@ -247,10 +229,10 @@ def _arrivals(maps: Jumps, rows: Indices) -> sparse.csr_array:
     return sparse.csr_array((share, (to, by)), shape=(len(rows), len(maps.row)))
 
 
-def _one_row(maps: Jumps) -> Jumps:
+def _one_row(maps: UpdateMaps) -> UpdateMaps:
     """Independent draws as a chain over one row."""
     zero = np.zeros(len(maps.row), dtype=np.int64)
-    return Jumps(maps.M, maps.c, zero, zero, maps.weight, np.ones(1), np.ones(1))
+    return UpdateMaps(maps.M, maps.c, zero, zero, maps.weight, np.ones(1), np.ones(1))
 
 
 def _triangle(q: int) -> tuple[Indices, Indices]:
@@ -267,7 +249,7 @@ def _unpacked(V: Floats, q: int) -> Floats:
     return whole
 
 
-def _blocks(maps: Jumps, moment: int) -> Floats:
+def _blocks(maps: UpdateMaps, moment: int) -> Floats:
     """p_k M_k, or p_k M_k ⊗ M_k on lower triangles, ``[K, m, m]``."""
     p = maps.probability[:, None, None]
     if moment == 1:
@@ -279,7 +261,7 @@ def _blocks(maps: Jumps, moment: int) -> Floats:
     return np.asarray(p * np.where(i == j, straight, straight + crossed))
 
 
-def _dense(maps: Jumps, rows: Indices, moment: int) -> Floats:
+def _dense(maps: UpdateMaps, rows: Indices, moment: int) -> Floats:
     blocks = _blocks(maps, moment)
     n, m = len(rows), blocks.shape[1]
     origin = np.searchsorted(rows, maps.row)
@@ -291,7 +273,7 @@ def _dense(maps: Jumps, rows: Indices, moment: int) -> Floats:
     return np.ascontiguousarray(whole.reshape(n, n, m, m).transpose(0, 2, 1, 3)).reshape(n * m, n * m)
 
 
-def _leading(maps: Jumps, moment: int) -> NDArray[np.complex128]:
+def _leading(maps: UpdateMaps, moment: int) -> NDArray[np.complex128]:
     """Leading eigenvalues of the mean (moment 1) or second-moment operator along a chain; all where it is small."""
     q, rows = maps.M.shape[1], np.unique(maps.row)
     size = len(rows) * (q if moment == 1 else q * (q + 1) // 2)

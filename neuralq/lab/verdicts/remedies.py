@@ -12,29 +12,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from neuralq.checks import check_positive
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.linear.spectrum import visible_process
-from neuralq.lab.methods import METHODS, Method, method
-from neuralq.lab.methods.emphatic import follow_on_second_moment
+from neuralq.lab.methods import Method, method
 from neuralq.lab.methods.method import Options
+from neuralq.lab.plain import fields_of
 from neuralq.lab.verdicts.critical import CRITICAL_PARAMETERS, scan
 from neuralq.lab.verdicts.diagnosis import Diagnosis, diagnose
-from neuralq.lab.verdicts.moments import second_moment_radius, unknowns
-from neuralq.lab.verdicts.update_maps import jumps
+from neuralq.lab.verdicts.moments import known_second_moment
 from neuralq_envs.counterexamples import Problem
 from neuralq_envs.counterexamples.chains import stationary_distribution
 
-__all__ = ["Remedy", "prescribe"]
+__all__ = ["Remedy", "prescribe", "usual_method"]
 
 _FROM_LOW = ("lambda_", "num_steps", "eta", "phi", "period", "beta_over_alpha")
 _FROM_HIGH = ("tau",)
 _OTHER_METHODS = ("gtd2", "tdrc", "htd", "etd", "lstd", "greedy-gq")
 _WAY_ON = 0.1  # share of the stable interval that is left between the recommendation and its edge
-_MOST_UNKNOWNS = 5_000  # of a second moment that is looked at beside each remedy
 
 _CHANGES = {
     "lambda_": "look further along the trajectory: λ = {value:.3g} in TD(λ) (it converges from λ = {edge:.4g} on)",
@@ -100,12 +99,31 @@ class Remedy:
         elif found.spectral_radius < 1:
             text += f" The slowest error shrinks to a tenth in {_round(self.updates_to_tenth)} updates."
         if found.fixed_point_error is not None and found.best_error is not None:
-            scale = max(found.scale or 0.0, 1.0)
-            error, best = (0.0 if x < 1e-9 * scale else x for x in (found.fixed_point_error, found.best_error))
+            error, best = found.rounded(found.fixed_point_error), found.rounded(found.best_error)
             text += f" It ends {error:.3g} (RMS) from the true values; the best weights are {best:.3g} from them."
         if self.scatters:
             text += " Single runs scatter ever more widely: only the average converges."
         return text
+
+    def plain(self) -> dict[str, Any]:
+        """The change and what it costs as text and numbers, as JSON takes it."""
+        return {
+            **fields_of(self, "kind", "change", "method", "options", "step_size", "critical", "updates_to_tenth"),
+            **fields_of(self.diagnosis, "spectral_radius", "fixed_point_error", "best_error"),
+            **fields_of(self, "second_moment_radius", "scatters"),
+            "explanation": self.explain(),
+        }
+
+
+def usual_method(problem: Problem) -> str:
+    """The name of the method that a problem is about: TD, or for control Q-learning, Sarsa where it is on-policy.
+
+    Example:
+        >>> from neuralq_envs.counterexamples import star
+        >>> usual_method(star())
+        'td'
+    """
+    return ("sarsa" if problem.exploration is not None else "q-learning") if problem.control else "td"
 
 
 def prescribe(problem: Problem, step_size: float | None = None) -> list[Remedy]:
@@ -136,14 +154,14 @@ def prescribe(problem: Problem, step_size: float | None = None) -> list[Remedy]:
             f"the values of {problem.name} are not linear in its weights: diagnose describes them locally, but what "
             "would make them converge is not known from that"
         )
-    base = ("sarsa" if problem.exploration is not None else "q-learning") if problem.control else "td"
+    base = usual_method(problem)
     trouble = diagnose(problem, base, alpha)
     if trouble.converges:
         return []
     found = [*_smaller_steps(problem, base, trouble), *_other_methods(problem, alpha)]
     if not problem.control:
         found += [*_parameters(problem, alpha), *_on_policy(problem, alpha)]
-    return sorted(found, key=_rank)
+    return sorted((one for one in found if one is not None), key=_rank)
 
 
 def _rank(remedy: Remedy) -> tuple[bool, int, float]:
@@ -156,7 +174,7 @@ def _rank(remedy: Remedy) -> tuple[bool, int, float]:
     return remedy.scatters, grade, remedy.updates_to_tenth
 
 
-def _parameters(problem: Problem, alpha: float) -> Iterator[Remedy]:
+def _parameters(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
     for parameter in (*_FROM_LOW, *_FROM_HIGH):
         found = scan(problem, parameter, step_size=alpha)
         if not found.stable:
@@ -164,10 +182,8 @@ def _parameters(problem: Problem, alpha: float) -> Iterator[Remedy]:
         low, high = found.stable[0] if parameter in _FROM_LOW else found.stable[-1]
         edge, far = (low, high) if parameter in _FROM_LOW else (high, low)
         value = _some_way_on(CRITICAL_PARAMETERS[parameter].spacing, edge, far)
-        remedy = _remedy(parameter, problem, method(found.method), {parameter: value}, alpha, edge,
-                         _CHANGES[parameter].format(value=value, edge=edge))  # fmt: skip
-        if remedy is not None:
-            yield remedy
+        change = _CHANGES[parameter].format(value=value, edge=edge)
+        yield _remedy(parameter, problem, method(found.method), {parameter: value}, alpha, edge, change)
 
 
 def _some_way_on(spacing: str, edge: float, far: float) -> float:
@@ -178,26 +194,22 @@ def _some_way_on(spacing: str, edge: float, far: float) -> float:
     return edge + _WAY_ON * (far - edge)
 
 
-def _smaller_steps(problem: Problem, base: str, trouble: Diagnosis) -> Iterator[Remedy]:
+def _smaller_steps(problem: Problem, base: str, trouble: Diagnosis) -> Iterator[Remedy | None]:
     bound = trouble.step_size_bound
     if bound is not None and 0 < bound <= trouble.step_size:
         smaller = bound / 2
         change = f"take smaller steps: α = {smaller:.3g} (it converges below α = {bound:.4g})"
-        remedy = _remedy("step_size", problem, method(base), {}, smaller, bound, change)
-        if remedy is not None:
-            yield remedy
+        yield _remedy("step_size", problem, method(base), {}, smaller, bound, change)
 
 
-def _other_methods(problem: Problem, alpha: float) -> Iterator[Remedy]:
+def _other_methods(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
     for name in _OTHER_METHODS:
         one = method(name)
         if (one.rows == "pairs") is problem.control:
-            remedy = _remedy("method", problem, one, {}, alpha, None, f"use another method: {one.title}")
-            if remedy is not None:
-                yield remedy
+            yield _remedy("method", problem, one, {}, alpha, None, f"use another method: {one.title}")
 
 
-def _on_policy(problem: Problem, alpha: float) -> Iterator[Remedy]:
+def _on_policy(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
     pi = problem.target_policy
     try:
         d = stationary_distribution(problem.mdp, pi)
@@ -205,36 +217,24 @@ def _on_policy(problem: Problem, alpha: float) -> Iterator[Remedy]:
         return  # the target policy has no distribution of its own
     follows = replace(problem, behaviour_policy=pi, state_distribution=d)
     change = "update on-policy: act by the target policy, so that states are updated as often as it visits them"
-    remedy = _remedy("distribution", follows, method("td"), {}, alpha, None, change)
-    if remedy is not None:
-        yield remedy
+    yield _remedy("distribution", follows, method("td"), {}, alpha, None, change)
 
 
 def _remedy(
     kind: str, problem: Problem, chosen: Method, options: Options, alpha: float, edge: float | None, change: str
 ) -> Remedy | None:
     """The remedy, if its diagnosis says that it is one."""
-    assert chosen in METHODS
     try:
         found = diagnose(problem, chosen, alpha, "expected", **options)
     except (ValueError, np.linalg.LinAlgError):
         return None  # the method has no solution here (γ = 1 without end, singular equations)
     if not found.converges:
         return None
-    second = _second_moment(problem, chosen, found.options, alpha)
+    if chosen.memory_growth is not None:
+        second: float | None = chosen.memory_growth(visible_process(linear_process(problem))[0], found.options)
+    else:
+        second = known_second_moment(problem, chosen, found.options, alpha, "markov")
     return Remedy(kind, change, problem, chosen.name, found.options, alpha, edge, found, second)
-
-
-def _second_moment(problem: Problem, chosen: Method, options: Options, alpha: float) -> float | None:
-    process, _ = visible_process(linear_process(problem))
-    if chosen.name == "etd":
-        return follow_on_second_moment(process, None if options["beta"] < 0 else options["beta"])
-    expected = None if chosen.expected is None else chosen.expected(process, options)
-    if expected is None or not expected.linear or chosen.learner is None or chosen.remembers(options):
-        return None
-    if unknowns(process, expected.size, "markov") > _MOST_UNKNOWNS:
-        return None
-    return second_moment_radius(jumps(process, chosen, options, alpha), "markov")
 
 
 def _round(updates: float) -> str:

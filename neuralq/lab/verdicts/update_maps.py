@@ -1,8 +1,8 @@
 """What one sampled update does along every transition, as an affine map read off the learner itself.
 
-A memoryless method changes θ ← M_k θ + c_k along arc k, exactly. The learner is run once on θ = 0, which gives c_k, and
-once on every unit vector e_i, which gives column i of M_k; nothing is derived by hand a second time, so the mean of the
-maps can be held against the expected update.
+A memoryless method changes θ ← M_k θ + c_k along transition k, exactly. The learner is run once on θ = 0, which gives
+c_k, and once on every unit vector e_i, which gives column i of M_k; nothing is derived by hand a second time, so the
+mean of the maps can be held against the expected update.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.process import Process
-from neuralq.lab.linear.sampling import sample_of_arcs
+from neuralq.lab.linear.sampling import sample_along
 from neuralq.lab.methods import Method
 from neuralq.lab.methods.method import Options
 from neuralq.types import Floats, Indices
 
-__all__ = ["Jumps", "jumps"]
+__all__ = ["UpdateMaps", "update_maps"]
 
 
 LARGEST = 20_000_000
@@ -28,8 +28,8 @@ _CHUNK = 2_000_000  # numbers of features in one call of a learner
 
 
 @dataclass(frozen=True, eq=False)
-class Jumps:
-    """What one sampled update does to θ along every arc: θ ← M_k θ + c_k.
+class UpdateMaps:
+    """What one sampled update does to θ along every transition: θ ← M_k θ + c_k.
 
     Args:
         M: ``[K, size, size]``.
@@ -56,22 +56,22 @@ class Jumps:
 
     @property
     def weight(self) -> Floats:
-        """Chance of each arc when rows are drawn independently, ``[K]``."""
+        """Chance of each transition when rows are drawn independently, ``[K]``."""
         return self.D[self.row] * self.probability
 
     def mean(self) -> tuple[Floats, Floats]:
         """E[M] and E[c] over independent draws: the expected update."""
         return np.einsum("k,kij->ij", self.weight, self.M), self.weight @ self.c
 
-    def within(self, kept: NDArray[np.bool_], V: Floats) -> Jumps:
-        """Some of the arcs, on the space of an orthonormal basis V that contains all they move; constants left out."""
+    def within(self, kept: NDArray[np.bool_], V: Floats) -> UpdateMaps:
+        """Some transitions, on the space of an orthonormal basis V that contains all they move; constants left out."""
         M = np.einsum("ai,kab,bj->kij", V, self.M[kept], V, optimize=True)
         c = np.zeros((len(M), V.shape[1]))
-        return Jumps(M, c, self.row[kept], self.next_row[kept], self.probability[kept], self.D, self.start)
+        return UpdateMaps(M, c, self.row[kept], self.next_row[kept], self.probability[kept], self.D, self.start)
 
 
-def jumps(process: Process, method: Method, options: Options, step_size: float) -> Jumps:
-    """The affine map of a memoryless method along every arc, read off its sampled update.
+def update_maps(process: Process, method: Method, options: Options, step_size: float) -> UpdateMaps:
+    """The affine map of a memoryless method along every transition, read off its sampled update.
 
     Where the update looks at a second, independent successor there is one map for every pair of successors.
 
@@ -85,62 +85,50 @@ def jumps(process: Process, method: Method, options: Options, step_size: float) 
         ValueError: the method has no sampled update or remembers earlier transitions, or the problem is too large.
 
     Example:
-        >>> from neuralq.lab.methods import TD
+        >>> from neuralq.lab.methods.td import TD
         >>> from neuralq.lab.linear.process import linear_process
         >>> from neuralq_envs.counterexamples import star
         >>> process = linear_process(star())
-        >>> maps = jumps(process, TD, TD.checked({}), 0.01)
+        >>> maps = update_maps(process, TD, TD.checked({}), 0.01)
         >>> expected = TD.expected(process, TD.checked({})).at(np.zeros(8), 0.01)[0]
         >>> len(maps.M), bool(np.allclose(maps.mean()[0], expected))
         (49, True)
     """
     if method.learner is None or method.expected is None or method.remembers(options):
-        raise ValueError(f"{method.title} with these options has no memoryless sampled update: it has no map per arc")
-    arcs, target = process.arcs, process.target_arcs
-    size = method.expected(process, options).size
-    count = np.diff(target.starts)[arcs.row]
-    arc = np.repeat(np.arange(len(arcs.row)), count)
-    second = target.starts[arcs.row[arc]] + np.arange(len(arc)) - np.repeat(np.cumsum(count) - count, count)
-    first = np.cumsum(count) - count
-    theta = np.tile(np.random.default_rng(0).normal(size=size), (len(arc), 1))
-    after = _updated(process, method, options, step_size, theta, arc, second)
-    chance = np.ones(len(arc))
-    if (after == after[first[arc]]).all():
-        arc, second = arc[first], second[first]
-        chance = chance[first]
-    else:
-        chance = target.probability[second]
-    if len(arc) * size * size > LARGEST:
         raise ValueError(
-            f"{len(arc)} transitions with maps of {size}x{size} are too many for exact moments; "
+            f"{method.title} with these options has no memoryless sampled update: it has no map per transition"
+        )
+    ways, target = process.transitions, process.target_transitions
+    size, learner_of = method.expected(process, options).size, method.learner
+
+    def after(theta: Floats, one: Indices, second: Indices) -> Floats:
+        learner = learner_of(process, theta[:, : process.num_weights].copy(), options)
+        learner.theta[:] = theta
+        learner.update(sample_along(process, one, second, np.ones(len(one), dtype=bool)), step_size)
+        return learner.theta
+
+    count = np.diff(target.starts)[ways.row]
+    first = np.cumsum(count) - count
+    one = np.repeat(np.arange(len(ways.row)), count)
+    second = target.starts[ways.row[one]] + np.arange(len(one)) - np.repeat(first, count)
+    chance = target.probability[second]
+    moved = after(np.tile(np.random.default_rng(0).normal(size=size), (len(one), 1)), one, second)
+    if (moved == moved[first[one]]).all():  # whatever the second successor is
+        one, second, chance = one[first], second[first], np.ones(len(first))
+    if len(one) * size * size > LARGEST:
+        raise ValueError(
+            f"{len(one)} transitions with maps of {size}x{size} are too many for exact moments; "
             "use sampling='expected', or run the method"
         )
-    M, c = _maps(process, method, options, step_size, size, arc, second)
-    return Jumps(M, c, arcs.row[arc], arcs.next_row[arc], arcs.probability[arc] * chance, process.D, process.start)
-
-
-def _maps(
-    process: Process, method: Method, options: Options, step_size: float, size: int, arc: Indices, second: Indices
-) -> tuple[Floats, Floats]:
     probes = np.vstack([np.zeros(size), np.eye(size)])
-    M, c = np.empty((len(arc), size, size)), np.empty((len(arc), size))
+    M, c = np.empty((len(one), size, size)), np.empty((len(one), size))
     stride = max(1, _CHUNK // ((size + 1) * max(size, process.num_weights, 1)))
-    for k in range(0, len(arc), stride):
+    for k in range(0, len(one), stride):
         some = slice(k, k + stride)
-        num = len(arc[some])
-        repeated = (np.repeat(x[some], size + 1) for x in (arc, second))
-        after = _updated(process, method, options, step_size, np.tile(probes, (num, 1)), *repeated)
-        after = after.reshape(num, size + 1, size)
-        c[some] = after[:, 0]
-        M[some] = np.swapaxes(after[:, 1:] - after[:, :1], 1, 2)
-    return M, c
-
-
-def _updated(
-    process: Process, method: Method, options: Options, step_size: float, theta: Floats, arc: Indices, second: Indices
-) -> Floats:
-    assert method.learner is not None
-    learner = method.learner(process, theta[:, : process.num_weights].copy(), options)
-    learner.theta[:] = theta
-    learner.update(sample_of_arcs(process, arc, second, np.ones(len(arc), dtype=bool)), step_size)
-    return learner.theta
+        repeated = (np.repeat(x[some], size + 1) for x in (one, second))
+        num = len(one[some])
+        found = after(np.tile(probes, (num, 1)), *repeated).reshape(num, size + 1, size)
+        c[some] = found[:, 0]
+        M[some] = np.swapaxes(found[:, 1:] - found[:, :1], 1, 2)
+    row = ways.row[one]
+    return UpdateMaps(M, c, row, ways.next_row[one], ways.probability[one] * chance, process.D, process.start)

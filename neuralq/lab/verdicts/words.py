@@ -17,13 +17,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.sampling import Sampling
 from neuralq.lab.methods.method import Options
+from neuralq.lab.plain import fields_of, plain
 from neuralq.types import Floats
 
 __all__ = ["POOR", "Diagnosis", "Region", "Verdict", "is_poor"]
@@ -126,6 +127,10 @@ class Diagnosis:
     follow_on: bool = False
     flow: bool = True
 
+    def rounded(self, error: float | None) -> float | None:
+        """An error as it is shown: 0 where it is what rounding leaves of values of this size."""
+        return 0.0 if error is not None and error < 1e-9 * max(self.scale or 0.0, 1.0) else error
+
     @property
     def rates(self) -> NDArray[np.complex128]:
         """(1 − factor)/α, for a flow the eigenvalues of its matrix A; one with a real part below 0 grows at every α."""
@@ -156,7 +161,17 @@ class Diagnosis:
             )
         return " ".join(sentences)
 
+    def plain(self) -> dict[str, Any]:
+        """Everything as text and numbers, as JSON takes it."""
+        factors = self.eigenvalues[np.isfinite(self.eigenvalues)]
+        return {**fields_of(self, *_PLAIN), "eigenvalues": plain(factors), "explanation": self.explain()}
 
+
+_PLAIN = (
+    *("problem", "method", "options", "sampling", "verdict", "converges", "step_size", "spectral_radius"),
+    *("second_moment_radius", "step_size_bound", "step_size_bound_second_moment", "doubling_time", "fixed_point_error"),
+    *("best_error", "distance_to_singularity", "drift", "oscillates", "rank", "updates", "local", "fixed_point"),
+)
 _HEADLINES: dict[Verdict, str] = {
     "converges": "converges",
     "diverges": "diverges",
@@ -273,9 +288,7 @@ def _solution(one: Diagnosis) -> list[str]:
     rests = bool(one.regions) and one.verdict == "diverges"
     if one.fixed_point_error is not None and one.best_error is not None and not rests:
         subject = "The fixed point is" if one.converges else "The fixed point, which it does not reach, is"
-        error, best = (
-            0.0 if x < 1e-9 * max(one.scale or 0.0, 1.0) else x for x in (one.fixed_point_error, one.best_error)
-        )
+        error, best = one.rounded(one.fixed_point_error), one.rounded(one.best_error)
         out.append(f"{subject} {error:.4g} (RMS) from the true values; the best weights are {best:.4g} from them.")
     if 0 < one.distance_to_singularity < 1e-3 and one.sampling == "expected":
         out.append(

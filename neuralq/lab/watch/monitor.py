@@ -287,7 +287,7 @@ class DivergenceMonitor:
             "largest_value": self._largest_value,
             "bound": self.bound,
             "growth": {name: None if fit is None else asdict(fit) for name, fit in fits.items()},
-            "kernels": [{"env_steps": at, "verdict": one.verdict} | _plain(one) for at, one in self.diagnoses],
+            "kernels": [{"env_steps": at, **one.plain()} for at, one in self.diagnoses],
             "kernel_unavailable": self.unavailable,
         }
 
@@ -304,11 +304,6 @@ class DivergenceMonitor:
         if self.alarms:
             parts.append(f"What may help: {'; '.join(self.alarms[-1].advice)}.")
         return " ".join(part.strip() for part in parts)
-
-
-def _plain(found: SampleDiagnosis) -> dict[str, Any]:
-    """Plain values, None for what is not a finite number, which JSON does not have."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(found).items()}
 
 
 def _absolute(value: Any) -> float | None:
