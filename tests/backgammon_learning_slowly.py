@@ -11,7 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from neuralq.systems.backgammon import ValueNetwork, learning_kernels
+from neuralq.systems.backgammon.kernels import choose
 from neuralq.systems.backgammon.network import equities
+from neuralq.systems.backgammon.torch_engine import Games, TorchValues, play_in_lockstep
 from neuralq_envs.backgammon import Position
 from neuralq_envs.backgammon.inputs import NUM_INPUTS, tesauro_dense
 from neuralq_envs.backgammon.rules import MAX_AFTERSTATES, START, afterstates, result
@@ -175,3 +177,19 @@ def boards_of_random_games(num_boards: int, rng: np.random.Generator) -> Array:
 
 def worst(a: Array, b: Array) -> float:
     return float(np.abs(a - b).max())
+
+
+def best_afterstate(net: ValueNetwork, board: Array, die_1: int, die_2: int) -> Array:
+    """The board that the compiled choice leaves to the other side."""
+    count = afterstates(board, die_1, die_2, net.scratch.boards)
+    return net.scratch.boards[choose(count, net.w, net.v, net.c, net.scratch)].copy()
+
+
+def play_in_turn(values: TorchValues, num_games: int, rng: np.random.Generator) -> Games:
+    """One game after another from one generator: the games that the kernel `play_batch` plays."""
+    games = [play_in_lockstep(values, [rng]) for _ in range(num_games)]
+    num_turns = np.concatenate([game.num_turns for game in games])
+    boards = np.zeros((num_turns.max(), num_games, 2, 25), np.int8)
+    for i, game in enumerate(games):
+        boards[: len(game.boards), i] = game.boards[:, 0]
+    return Games(boards, num_turns, np.concatenate([game.points for game in games]))

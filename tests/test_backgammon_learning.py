@@ -17,9 +17,11 @@ import pytest
 import torch
 from backgammon_learning_slowly import (
     batch,
+    best_afterstate,
     boards_of_random_games,
     drawn,
     online,
+    play_in_turn,
     sigmoid,
     slow_batch,
     slow_choice,
@@ -72,7 +74,7 @@ def test_values_and_choices_are_those_of_all_inputs(num_outputs: int) -> None:
     for i in rng.choice(np.flatnonzero(going_on), 150):
         dice = int(rng.integers(1, 7)), int(rng.integers(1, 7))
         position = Position.from_board(boards[i])
-        assert Position.from_board(exact.best_afterstate(boards[i], *dice)) == slow_choice(exact, position, dice)
+        assert Position.from_board(best_afterstate(exact, boards[i], *dice)) == slow_choice(exact, position, dice)
 
 
 def test_the_sigmoid_of_float32_is_wrong_by_less_than_5e_7() -> None:
@@ -246,7 +248,7 @@ def test_batches_in_torch_are_those_of_the_kernel(lambda_: float, num_outputs: i
     net = drawn(num_outputs)
     values = TorchValues(net)
     total, tally = batch(net, 5, lambda_, np.random.default_rng(10))
-    games = torch_engine.play_in_turn(values, 5, np.random.default_rng(10))
+    games = play_in_turn(values, 5, np.random.default_rng(10))
     assert games.num_turns.sum() == tally[3] and len(set(games.num_turns.tolist())) > 1
     found = torch_engine.batch_gradient(values, games, lambda_).numpy()
     assert worst(-found * tally[3], total) < 1e-10 * max(1.0, np.abs(total).max())
@@ -270,7 +272,7 @@ def test_steps_of_adam_in_torch_are_those_of_the_compiled_engine() -> None:
     learner.play(6)
     for first in range(0, 6, 2):
         rate = settings.step_sizes(np.array([first]))[0]
-        plain.learn(torch_engine.play_in_turn(plain.values, 2, dice), float(rate), settings.lambda_)
+        plain.learn(play_in_turn(plain.values, 2, dice), float(rate), settings.lambda_)
     assert worst(twin.flat, learner.network.flat) <= 1e-10
 
 
@@ -372,7 +374,7 @@ def points_against_random(net: ValueNetwork, num_games: int, rng: np.random.Gene
         while result(board) == 0:
             dice = slow_roll(rng, False)
             if turn == 0:
-                board = net.best_afterstate(board, *dice)
+                board = best_afterstate(net, board, *dice)
             else:
                 board = room[rng.integers(afterstates(board, *dice, room))].copy()
             turn = 1 - turn

@@ -31,7 +31,6 @@ from neuralq.runs.folder.run_folder import (
     read_metrics,
     read_seed,
     read_summary,
-    read_versions,
 )
 
 CONFIG = {"env": "CartPole-v1", "lambda_": 0.65, "learning_rate": 1e-05, "hidden": [64, 64], "target": None, "on": True}
@@ -45,10 +44,10 @@ def test_a_new_run_says_what_it_was_told_and_what_it_ran_on(tmp_path: Path) -> N
     path = tmp_path / "deep" / "run"
     assert not is_run_folder(path)
     with make(path) as run:
-        assert run.checkpoints_path == path / "checkpoints" and run.report_path == path / "report.html"
+        assert run.checkpoints_path == path / "checkpoints"
     assert is_run_folder(path)
     assert read_config(path) == CONFIG and read_seed(path) == 3 and read_metrics(path) == []
-    versions = read_versions(path)
+    versions = json.loads((path / "versions.json").read_text())
     assert versions["torch"] == torch.__version__ and versions["numpy"] == np.__version__
     assert {"python", "gymnasium", "numba", "neuralq", "platform"} <= versions.keys()
 
@@ -217,7 +216,7 @@ def test_the_summary_is_replaced_whole_and_missing_until_written(tmp_path: Path)
 
 
 def test_folders_that_are_no_runs_are_refused(tmp_path: Path) -> None:
-    for read in (read_config, read_metrics, read_seed, read_summary, read_versions, RunFolder.open):
+    for read in (read_config, read_metrics, read_seed, read_summary, RunFolder.open):
         with pytest.raises(RunFolderError, match=r"no neuralq run in .*neuralq train"):
             read(tmp_path)
     marker = tmp_path / "run.json"

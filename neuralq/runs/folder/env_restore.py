@@ -122,7 +122,9 @@ class _Restorer:
             if _COMPARED[kind](existing) != node["value" if kind == "fixed" else "sha256"]:
                 raise NotCopyable(f"{path} is not what it was when the environment was saved")
             return existing
-        handler: Callable[..., Any] = getattr(self, f"_{kind}")
+        if kind in _LEAVES:
+            return _LEAVES[kind](node)
+        handler: Callable[..., Any] = self._seeded if kind in _SEEDED else getattr(self, f"_{kind}")
         if "ref" not in node:
             return handler(existing, node, path, owner)
         free = id(existing) not in self.used and (node["shared"] or id(existing) not in constants_of(owner))
@@ -142,15 +144,6 @@ class _Restorer:
         found = list(existing) if isinstance(existing, list | tuple | deque) else []
         found += [None] * (len(nodes) - len(found))
         return [self.restore(e, n, f"{path}[{i}]", owner) for i, (e, n) in enumerate(zip(found, nodes, strict=False))]
-
-    def _scalar(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> Any:
-        return node["value"][()]
-
-    def _complex(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> complex:
-        return complex(*node["parts"])
-
-    def _bytes(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> bytes:
-        return bytes(node["value"].tobytes())
 
     def _enum(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> enum.Enum:
         cls = _loaded_class(node["type"])
@@ -205,19 +198,10 @@ class _Restorer:
         target.bit_generator.state = node["state"]
         return target
 
-    def _random_state(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> np.random.RandomState:
-        target = existing if isinstance(existing, np.random.RandomState) else np.random.RandomState(0)
-        target.set_state(node["state"])
-        return target
-
-    def _python_random(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> random.Random:
-        target = existing if type(existing) is random.Random else random.Random(0)
-        target.setstate(node["state"])
-        return target
-
-    def _torch_generator(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> torch.Generator:
-        target = existing if isinstance(existing, torch.Generator) else torch.Generator(node["device"])
-        target.set_state(node["state"])
+    def _seeded(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> Any:
+        cls, make, set_state = _SEEDED[node["kind"]]
+        target = existing if type(existing) is cls else make(node)
+        set_state(target, node["state"])
         return target
 
     def _list(self, existing: Any, node: dict[str, Any], path: str, owner: type) -> list[Any]:
@@ -321,12 +305,19 @@ def _class_for(name: str, existing: Any, owner: type, path: str) -> type:
     return cls
 
 
-def _table_digest(value: Any) -> str:
-    return hashlib.sha256(repr(value).encode()).hexdigest()
-
-
+_LEAVES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "scalar": lambda node: node["value"][()],
+    "complex": lambda node: complex(*node["parts"]),
+    "bytes": lambda node: bytes(node["value"].tobytes()),
+}
+_SEEDED: dict[str, tuple[type, Callable[[dict[str, Any]], Any], Callable[[Any, Any], object]]] = {
+    "random_state": (np.random.RandomState, lambda node: np.random.RandomState(0), np.random.RandomState.set_state),
+    "python_random": (random.Random, lambda node: random.Random(0), random.Random.setstate),
+    "torch_generator": (torch.Generator, lambda node: torch.Generator(node["device"]), torch.Generator.set_state),
+}
+"""Generators beside NumPy's: class, how one is made, and how it takes a state."""
 _COMPARED: dict[str, Callable[[Any], str | None]] = {
     "fixed": fixed_description,
-    "constant": _table_digest,
+    "constant": lambda value: hashlib.sha256(repr(value).encode()).hexdigest(),
     "constant_array": lambda value: array_digest(value) if isinstance(value, np.ndarray) else None,
 }

@@ -45,7 +45,6 @@ __all__ = [
     "read_metrics",
     "read_seed",
     "read_summary",
-    "read_versions",
     "refuse_old_run",
 ]
 
@@ -126,11 +125,6 @@ class RunFolder:
     def metrics_path(self) -> Path:
         """One JSON object per line."""
         return self.path / "metrics.jsonl"
-
-    @property
-    def report_path(self) -> Path:
-        """The report of this run, once there is one."""
-        return self.path / "report.html"
 
     def append_metrics(self, row: Mapping[str, float | int | str | None]) -> None:
         """One line more in ``metrics.jsonl``, out of this process's hands when the call returns.
@@ -237,16 +231,6 @@ def read_config(path: str | Path) -> dict[str, Any]:
     """
     _read_marker(Path(path))
     return read_json(Path(path) / "config.json")
-
-
-def read_versions(path: str | Path) -> dict[str, str]:
-    """The versions that a run was started with.
-
-    Raises:
-        RunFolderError: if there is no run in ``path``, or its file is damaged.
-    """
-    _read_marker(Path(path))
-    return read_json(Path(path) / "versions.json")
 
 
 def read_seed(path: str | Path) -> int:

@@ -12,11 +12,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from neuralq.checks import check_choice, check_positive, check_whole
-from neuralq.systems.backgammon.kernels import choose, evaluate, new_scratch
+from neuralq.systems.backgammon.kernels import evaluate, new_scratch
 from neuralq.types import Array
 from neuralq_envs.backgammon.expert import NUM_EXPERT
 from neuralq_envs.backgammon.inputs import NUM_INPUTS
-from neuralq_envs.backgammon.rules import Board, afterstates
+from neuralq_envs.backgammon.rules import Board
 
 __all__ = ["ValueNetwork", "equities"]
 
@@ -100,12 +100,6 @@ class ValueNetwork:
         y = np.empty((len(boards), self.num_outputs), self.dtype)
         evaluate(np.ascontiguousarray(boards, np.int8), self.w, self.v, self.c, self.scratch, y)
         return y
-
-    def best_afterstate(self, board: Board, die_1: int, die_2: int) -> Board:
-        """The board ``[2, 25]`` to leave to the other side, of all in which a turn with these dice can end."""
-        count = afterstates(board, die_1, die_2, self.scratch.boards)
-        best: Board = self.scratch.boards[choose(count, self.w, self.v, self.c, self.scratch)].copy()
-        return best
 
     def copy(self) -> ValueNetwork:
         """The same weights, with scratch of its own."""

@@ -5,8 +5,8 @@ autograd, traces by `neuralq.rules.accumulate`, returns by `neuralq.rules.lambda
 
 * `play_online` draws the same dice in the same order as the kernel of that name: from one generator both play the same
   games, and the weights agree within 1e-10 after 200 games.
-* `play_in_turn` plays game after game from one generator, as the kernel `play_batch` does: the same games, and the same
-  gradient within 1e-10.
+* games played one after another from one generator are those of the kernel `play_batch`, and the gradient is the same
+  within 1e-10.
 * `play_in_lockstep` plays many games at once, the afterstates of all of them being judged in one forward pass, and
   this is what batched learning with this engine does. Here every game has a generator of its own, for otherwise the
   dice would depend on which games are played beside it. A game is then the one that the kernel plays from that
@@ -29,7 +29,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neuralq.checks import check_whole
 from neuralq.learners.optim import FlatOptimiser, Optimiser
 from neuralq.rules import accumulate, lambda_returns
 from neuralq.systems.backgammon.network import ValueNetwork, equities
@@ -45,7 +44,6 @@ __all__ = [
     "dense_inputs",
     "outcome",
     "play_in_lockstep",
-    "play_in_turn",
     "play_online",
     "seen_by_first",
 ]
@@ -266,32 +264,6 @@ def play_in_lockstep(values: TorchValues, dice: Sequence[np.random.Generator]) -
             points[ended] = won if len(history) % 2 == 1 else -won
         alive = [game for game in alive if points[game] == 0]
     return Games(np.stack(history), num_turns, points)
-
-
-def play_in_turn(values: TorchValues, num_games: int, rng: np.random.Generator) -> Games:
-    """Plays one game after another from one generator: the games that the kernel `play_batch` plays.
-
-    Args:
-        values: play both sides.
-        num_games: how many.
-        rng: draws the dice of all.
-
-    Raises:
-        ValueError: no whole number of games.
-
-    Example:
-        >>> values = TorchValues(ValueNetwork.drawn(4, 1, np.random.default_rng(0)))
-        >>> play_in_turn(values, 2, np.random.default_rng(0)).points.shape
-        (2,)
-    """
-    check_whole("num_games", num_games)
-    games = [play_in_lockstep(values, [rng]) for _ in range(num_games)]
-    num_turns = np.concatenate([game.num_turns for game in games])
-    points = np.concatenate([game.points for game in games])
-    boards = np.zeros((num_turns.max(), num_games, 2, 25), np.int8)
-    for i, game in enumerate(games):
-        boards[: len(game.boards), i] = game.boards[:, 0]
-    return Games(boards, num_turns, points)
 
 
 def batch_gradient(values: TorchValues, games: Games, lambda_: float) -> Tensor:
