@@ -67,10 +67,10 @@ class MlpEngine:
         self._target_values: Any = None
         layers, norms = net.trunk.layers, net.trunk.norms
         places = [layer_places(self.flat, x.weight, x.bias, norms, i) for i, x in enumerate(layers)]
-        plan = np.array([(*x.weight.shape[1:], *at) for x, at in zip(layers, places, strict=True)], np.int64)
-        starts = np.concatenate([[0], np.cumsum(plan[:-1, 1])])
+        plan = np.array([(*x.weight.shape[1:], *at, 0) for x, at in zip(layers, places, strict=True)], np.int64)
+        plan[1:, 6] = np.cumsum(plan[:-1, 1])
         activation = list(ACTIVATIONS).index(net.trunk.activation)
-        self._network: Any = plan, starts, self._layout, self._num_actions, activation
+        self._network: Any = plan, self._layout, self._num_actions, activation
         self._units = int(plan[:, 1].sum())
         widest, largest = int(plan[:, :2].max()), int((plan[:, 0] * plan[:, 1]).max())
         self._spare = self._space(2 * max(widest, largest))

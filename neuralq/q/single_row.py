@@ -57,14 +57,13 @@ class SingleRowNetwork:
         self._stem: Any = q.input.stem
         self._dtype: torch.dtype = engine.flat.values.dtype
         plan = _plan_of(q, engine.flat)
-        ends = np.cumsum(plan[:, 2])
-        starts = np.concatenate([[0], ends[:-1]])
         activation = list(ACTIVATIONS).index(q.trunk.activation)
         self._params, self._grads = engine.flat.values.numpy(), engine.flat.grad.numpy()
-        self._network: Any = plan, starts, activation
+        self._network: Any = plan, activation
         # Of one convolution at a time: (fan_in of a channel) · (positions).
         patches = int((plan[:, 7] * plan[:, 11] ** 2 * plan[:, 13] * plan[:, 14]).max())
-        sizes = (int(ends[-1]), int(ends[-1]), len(plan), patches, int(ends[-1]))
+        units = int(plan[:, 2].sum())
+        sizes = (units, units, len(plan), patches, units)
         *work, self._deltas = (torch.zeros(size, dtype=self._dtype).numpy() for size in sizes)
         self._work: Any = tuple(work)  # acts, hats, inverse, cols
 
@@ -115,4 +114,6 @@ def _plan_of(q: Any, flat: FlatParameters) -> Any:
     for i, layer in enumerate(trunk.layers):
         places = layer_places(flat, layer.weight, layer.bias, trunk.norms, i)
         plan.append((kernels.DENSE, *layer.weight.shape[1:], *places, *(0,) * 8))
-    return np.array(plan, np.int64)
+    table = np.array([(*row, 0) for row in plan], np.int64)
+    table[1:, 15] = np.cumsum(table[:-1, 2])
+    return table

@@ -6,8 +6,9 @@ tests/test_engine.py for every layout, loss, activation and normalisation.
 
 The network is described by ``plan``, one row per layer: fan_in, fan_out, and the offsets in the flat vector of weight
 ``[copies, in, out]``, bias ``[copies, out]``, and scale and shift of the layer normalisation (−1: none, −2: one without
-scale and shift). Workspaces hold for each layer a block ``[rows, fan_out]``: ``acts`` what it gave, ``hats`` the
-normalised pre-activation, ``deltas`` the gradient with respect to it; ``inverse`` holds 1/σ of each row.
+scale and shift), then the units of the layers before. Workspaces hold for each layer a block ``[rows, fan_out]`` behind
+theirs: ``acts`` what it gave, ``hats`` the normalised pre-activation, ``deltas`` the gradient with respect to it;
+``inverse`` holds 1/σ of each row.
 
 The two entries call `_forward` and `_backward` in one place each, whatever the layout: every further call is inlined
 and compiled again, and that was half of the seconds that the first use on a machine takes.
@@ -86,15 +87,7 @@ def _normalise_rows(y: Array, scale: Array, shift: Array, hat: Array, inverse: A
 
 @reassociating_kernel
 def _forward(
-    params: Array,
-    plan: Array,
-    starts: Array,
-    copy: int,
-    activation: int,
-    x: Array,
-    acts: Array,
-    hats: Array,
-    inverse: Array,
+    params: Array, plan: Array, copy: int, activation: int, x: Array, acts: Array, hats: Array, inverse: Array
 ) -> Array:
     rows = x.shape[0]
     num_layers = plan.shape[0]
@@ -103,7 +96,7 @@ def _forward(
         fan_in, fan_out = plan[layer, 0], plan[layer, 1]
         weight_at = plan[layer, 2] + copy * fan_in * fan_out
         bias_at = plan[layer, 3] + copy * fan_out
-        block = rows * starts[layer]
+        block = rows * plan[layer, 6]
         y = acts[block : block + rows * fan_out].reshape(rows, fan_out)
         last = layer == num_layers - 1
         if suits(fan_in, fan_out):
@@ -114,23 +107,22 @@ def _forward(
             for i in range(rows):
                 for j in range(fan_out):
                     y[i, j] += params[bias_at + j]
-        if not last and activation == 0 and plan[layer, 4] == -1:
+        if not last and plan[layer, 4] != -1:
+            width = fan_out if plan[layer, 4] >= 0 else 0  # of scale and shift
+            at = max(plan[layer, 4], 0) + copy * width
+            scale = params[at : at + width]
+            at = max(plan[layer, 5], 0) + copy * width
+            shift = params[at : at + width]
+            hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
+            _normalise_rows(y, scale, shift, hat, inverse[rows * layer : rows * (layer + 1)], activation)
+        elif not last and activation == 0:
             for i in range(rows):
                 for j in range(fan_out):
                     y[i, j] = params.dtype.type(0) if y[i, j] <= 0 else y[i, j]  # NaN stays
-        if not last:
-            if plan[layer, 4] != -1:
-                width = fan_out if plan[layer, 4] >= 0 else 0  # of scale and shift
-                at = max(plan[layer, 4], 0) + copy * width
-                scale = params[at : at + width]
-                at = max(plan[layer, 5], 0) + copy * width
-                shift = params[at : at + width]
-                hat = hats[block : block + rows * fan_out].reshape(rows, fan_out)
-                _normalise_rows(y, scale, shift, hat, inverse[rows * layer : rows * (layer + 1)], activation)
-            elif activation != 0:
-                for i in range(rows):
-                    for j in range(fan_out):
-                        y[i, j] = _activate(y[i, j], activation)
+        elif not last:
+            for i in range(rows):
+                for j in range(fan_out):
+                    y[i, j] = _activate(y[i, j], activation)
         h, h_at = acts, block
     return y
 
@@ -176,7 +168,6 @@ def _backward(
     params: Array,
     grads: Array,
     plan: Array,
-    starts: Array,
     copy: int,
     activation: int,
     x: Array,
@@ -195,7 +186,7 @@ def _backward(
     num_layers = plan.shape[0]
     for layer in range(num_layers - 1, -1, -1):
         fan_in, fan_out = plan[layer, 0], plan[layer, 1]
-        block = rows * starts[layer]
+        block = rows * plan[layer, 6]
         end = block + rows * fan_out
         d = deltas[block:end].reshape(rows, fan_out)
         if layer < num_layers - 1:
@@ -217,7 +208,7 @@ def _backward(
         at = plan[layer, 2] + copy * fan_in * fan_out
         h, h_at = x.reshape(-1), 0
         if layer > 0:
-            h, h_at = acts, rows * starts[layer - 1]
+            h, h_at = acts, rows * plan[layer - 1, 6]
         if suits(rows, fan_out):
             multiply(h, h_at, 1, fan_in, fan_in, rows, deltas, block, fan_out, spare, 0, grads, at)
         else:
@@ -249,7 +240,6 @@ def _pair(pairs: Array, row: int, x: Array, i: int, action: int) -> None:
 def all_values(
     params: Array,
     plan: Array,
-    starts: Array,
     layout: int,
     num_actions: int,
     activation: int,
@@ -269,7 +259,7 @@ def all_values(
             for c in range(num_actions):
                 _pair(inputs, i * num_actions + c, x, i, c)
     for copy in range(num_actions if layout == SEPARATE else 1):
-        q = _forward(params, plan, starts, copy, activation, inputs, acts, hats, inverse)
+        q = _forward(params, plan, copy, activation, inputs, acts, hats, inverse)
         if layout == SEPARATE:
             for i in range(rows):
                 out[i, copy] = q[i, 0]
@@ -296,7 +286,6 @@ def loss_gradient(
     params: Array,
     grads: Array,
     plan: Array,
-    starts: Array,
     layout: int,
     num_actions: int,
     activation: int,
@@ -327,7 +316,7 @@ def loss_gradient(
         grads[i] = 0
     if rows == 0:
         return -1
-    top = starts[plan.shape[0] - 1]
+    top = plan[-1, 6]
     outputs = num_actions if layout == ACTION_OUTPUT else 1
     inputs = x
     for copy in range(num_actions if layout == SEPARATE else 1):
@@ -346,7 +335,7 @@ def loss_gradient(
             inputs = pairs[: rows * (width + num_actions)].reshape(rows, width + num_actions)
             for i in range(rows):
                 _pair(inputs, i, x, i, a[i])
-        q = _forward(params, plan, starts, copy, activation, inputs, acts, hats, inverse)
+        q = _forward(params, plan, copy, activation, inputs, acts, hats, inverse)
         slope = deltas[count * top : count * (top + outputs)].reshape(count, outputs)
         row = 0
         for i in range(rows):
@@ -358,5 +347,5 @@ def loss_gradient(
             q_out[i] = q[row, c]
             slope[row, c] = _slope(q[row, c], target[i], weight[i], loss, delta, rows)
             row += 1
-        _backward(params, grads, plan, starts, copy, activation, inputs, acts, hats, inverse, deltas, spare)
+        _backward(params, grads, plan, copy, activation, inputs, acts, hats, inverse, deltas, spare)
     return -1

@@ -8,11 +8,11 @@ The network has one output per action. ``plan`` has one row per layer:
 
     0 kind · 1 inputs · 2 outputs · 3 weight at · 4 bias at · 5 scale at (−1: no normalisation, −2: one without scale
     and shift) · 6 shift at · and for convolutions 7 channels in · 8 height in · 9 width in · 10 channels out ·
-    11 side of the kernel · 12 stride · 13 height out · 14 width out.
+    11 side of the kernel · 12 stride · 13 height out · 14 width out · and for all 15 where its block begins in ``acts``
+    (what it gave), ``hats`` (normalised) and ``deltas`` (gradients).
 
-Dense weights lie as ``[in, out]``, convolutional ones as ``[out, in, k, k]``. ``starts`` says where each layer's block
-begins in ``acts`` (what it gave), ``hats`` (normalised) and ``deltas`` (gradients); ``inverse`` holds 1/σ per layer;
-``cols`` is room for the patches of one convolution.
+Dense weights lie as ``[in, out]``, convolutional ones as ``[out, in, k, k]``. ``inverse`` holds 1/σ per layer; ``cols``
+is room for the patches of one convolution.
 """
 
 from __future__ import annotations
@@ -110,20 +110,12 @@ def _activate(y: Array, activation: int) -> None:
 
 @reassociating_kernel
 def _forward(
-    params: Array,
-    plan: Array,
-    starts: Array,
-    activation: int,
-    x: Array,
-    acts: Array,
-    hats: Array,
-    inverse: Array,
-    cols: Array,
+    params: Array, plan: Array, activation: int, x: Array, acts: Array, hats: Array, inverse: Array, cols: Array
 ) -> Array:
     h = x
     for layer in range(plan.shape[0]):
         row = plan[layer]
-        block, end = starts[layer], starts[layer] + row[2]
+        block, end = row[15], row[15] + row[2]
         y = acts[block:end]
         if row[0] == CONV:
             _conv(params, row, h, y, cols)
@@ -139,12 +131,12 @@ def _forward(
 
 @reassociating_kernel
 def values_of(
-    params: Array, plan: Array, starts: Array, activation: int, x: Array, acts: Array, hats: Array,
+    params: Array, plan: Array, activation: int, x: Array, acts: Array, hats: Array,
     inverse: Array, cols: Array, out: Array,
 ) -> None:  # fmt: skip
     """Action values of every row: ``x [B, d]`` into ``out [B, A]``."""
     for i in range(x.shape[0]):
-        q = _forward(params, plan, starts, activation, x[i], acts, hats, inverse, cols)
+        q = _forward(params, plan, activation, x[i], acts, hats, inverse, cols)
         for c in range(out.shape[1]):
             out[i, c] = q[c]
 
@@ -226,22 +218,22 @@ def _conv_back(params: Array, grads: Array, row: Array, d: Array, x: Array, belo
 
 @reassociating_kernel
 def _backward(
-    params: Array, grads: Array, plan: Array, starts: Array, activation: int, x: Array, acts: Array, hats: Array,
+    params: Array, grads: Array, plan: Array, activation: int, x: Array, acts: Array, hats: Array,
     inverse: Array, deltas: Array, cols: Array,
 ) -> None:  # fmt: skip
     """Gradient of the output weighted by the top block of ``deltas``, written over ``grads``."""
     top = plan.shape[0] - 1
     for layer in range(top, -1, -1):
         row = plan[layer]
-        block, end = starts[layer], starts[layer] + row[2]
+        block, end = row[15], row[15] + row[2]
         d = deltas[block:end]
         if layer < top:
             _through_layer(params, grads, row, d, acts[block:end], hats[block:end], inverse[layer], activation)
         h = x
         below = deltas[0:0]
         if layer > 0:
-            h = acts[starts[layer - 1] : block]
-            below = deltas[starts[layer - 1] : block]
+            h = acts[plan[layer - 1, 15] : block]
+            below = deltas[plan[layer - 1, 15] : block]
         if row[0] == CONV:
             _conv_back(params, grads, row, d, h, below, cols)
         else:
@@ -250,14 +242,14 @@ def _backward(
 
 @reassociating_kernel
 def learn(
-    params: Array, grads: Array, plan: Array, starts: Array, activation: int, x_tm1: Array, a_tm1: int, r_t: float,
+    params: Array, grads: Array, plan: Array, activation: int, x_tm1: Array, a_tm1: int, r_t: float,
     discount_t: float, x_t: Array, acts: Array, hats: Array, inverse: Array, cols: Array, deltas: Array,
 ) -> tuple[float, float, bool]:  # fmt: skip
     """Write ∇Q(s_tm1, a_tm1) over ``grads``; returns Q(s_tm1, a_tm1), the target and whether a_tm1 was greedy."""
-    num_actions, top = plan[-1, 2], starts[-1]
+    num_actions, top = plan[-1, 2], plan[-1, 15]
     best = acts[top]
     for side in range(2):  # one call in one place: every further one is inlined and compiled again
-        q = _forward(params, plan, starts, activation, x_t if side == 0 else x_tm1, acts, hats, inverse, cols)
+        q = _forward(params, plan, activation, x_t if side == 0 else x_tm1, acts, hats, inverse, cols)
         if side == 0:
             best = q[0]
             for c in range(1, num_actions):
@@ -271,5 +263,5 @@ def learn(
         if acts[top + c] > value:
             greedy = False
     deltas[top + a_tm1] = 1
-    _backward(params, grads, plan, starts, activation, x_tm1, acts, hats, inverse, deltas, cols)
+    _backward(params, grads, plan, activation, x_tm1, acts, hats, inverse, deltas, cols)
     return value, target, greedy
