@@ -23,7 +23,7 @@ ORDER = (
 
 MINE = '''"""TD(0) with a step that is a share of the usual one."""
 
-from neuralq.lab.methods.method import Method, Option, flow
+from neuralq.lab.methods.record import Method, Option, flow
 from neuralq.lab.methods.operators import td
 from neuralq.lab.methods.td import TD
 

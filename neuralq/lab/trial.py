@@ -24,8 +24,8 @@ from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.sampling import Sampling, stream
 from neuralq.lab.methods import Expected, Method
 from neuralq.lab.methods import method as method_named
-from neuralq.lab.methods.method import Options, Piece
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.lab.methods.record import Options, Piece
 from neuralq.lab.plain import fields_of, plain
 from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from itertools import chain, groupby
 from multiprocessing import get_context
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from neuralq.apps.cli import Failure, command_parser
 from neuralq.apps.cli.lab import Parser, show
 from neuralq.apps.cli.lab_cases import COLOURS
+from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.checks import check_whole
 from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, problem
 from neuralq.lab import matrix as matrix_of
@@ -47,7 +45,7 @@ _DETAILED = 60  # cells up to which each has a line of its own
 _NAME_WIDTH = 22
 _CELL_WIDTH = 3
 
-Tick = Callable[[str, str, int, int], None]
+Bar = ProgressBar[tuple[str, str, int, int]]
 
 
 def matrix(argv: list[str]) -> int:
@@ -60,8 +58,8 @@ def matrix(argv: list[str]) -> int:
     for name in ("seeds", "num_steps", "jobs"):
         check_whole(f"--{name.replace('_', '-')}", getattr(options, name))
     sampled = {name: getattr(options, name) for name in ("sampling", "num_steps", "seed")}
-    with _progress(len(problems) * len(methods)) as tick:
-        found = _in_parallel(problems, methods, options.jobs, tick, num_seeds=options.seeds, **sampled)
+    with _progress(len(problems) * len(methods)) as bar:
+        found = _in_parallel(problems, methods, options.jobs, bar, num_seeds=options.seeds, **sampled)
     if options.csv is not None:
         found.write_csv(options.csv)
     parts: list[RenderableType] = list(_lines(found.cells)) if options.list or few else list(_grids(found))
@@ -110,30 +108,22 @@ def _names(given: list[str] | None, every: list[str], lookup: Callable[[str], ob
     return every if given is None else [name for name in every if name in given]
 
 
-def _in_parallel(problems: list[str], methods: list[str], jobs: int, tick: Tick, **sampled: Any) -> Matrix:
+def _in_parallel(problems: list[str], methods: list[str], jobs: int, bar: Bar, **sampled: Any) -> Matrix:
     """The matrix, its rows spread over processes."""
     if jobs == 1 or len(problems) == 1:
-        return matrix_of(problems, methods, tick, **sampled)
+        return matrix_of(problems, methods, lambda *at: bar(at), **sampled)
     rows = []
     with ProcessPoolExecutor(min(jobs, len(problems)), mp_context=get_context("spawn")) as pool:
         waiting = [pool.submit(matrix_of, [name], methods, **sampled) for name in problems]
         for i, one in enumerate(waiting):
             rows.append(one.result())
-            tick(problems[i], "", (i + 1) * len(methods), len(problems) * len(methods))
+            bar((problems[i], "", (i + 1) * len(methods), len(problems) * len(methods)))
     return Matrix(tuple(problems), tuple(methods), tuple(chain.from_iterable(row.cells for row in rows)))
 
 
-@contextmanager
-def _progress(total: int) -> Iterator[Tick]:
-    console = Console(file=sys.stderr)
-    bar = Progress(
-        SpinnerColumn(), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(compact=True),
-        TextColumn("{task.description}", markup=False), console=console,
-        disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
-    with bar:
-        task = bar.add_task("", total=total)
-        yield lambda one, method, index, _: bar.update(task, completed=index, description=f"{one} {method}")
+def _progress(total: int) -> Bar:
+    """A bar for cells, which are reported as problem, method, index and how many there are."""
+    return ProgressBar(total, lambda at: Told(at[2], at[:2]))
 
 
 def _grids(found: Matrix) -> Iterator[RenderableType]:
@@ -253,8 +243,8 @@ def baird(argv: list[str]) -> int:
     one = star_of(options)
     results = show_star(star_console(options), one, options.num_steps, options.seed)
     methods = [name.name for name in METHODS if name.rows != "pairs"]
-    with _progress(len(methods)) as tick:
-        found = matrix_of([one], methods, tick)
+    with _progress(len(methods)) as bar:
+        found = matrix_of([one], methods, lambda *at: bar(at))
     plain = {"baird": [result.plain() for result in results], **found.plain()}
     show(options.json, plain, "", Text("what every method makes of the linear features", "bold"), *_lines(found.cells),
          *_findings(found))  # fmt: skip

@@ -6,12 +6,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Generic, NamedTuple, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TextIO, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from neuralq.runs.kinds import Kind
+if TYPE_CHECKING:
+    from neuralq.runs.kinds import Kind
 
 __all__ = ["ProgressBar", "Told", "told_of_rows", "training_bar"]
 

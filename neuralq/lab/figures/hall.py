@@ -16,7 +16,7 @@ from neuralq.checks import check_choice, check_whole
 from neuralq.lab.figures.drawing import EXACT, Drawing, Panel, Series
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.methods import method as method_named
-from neuralq.lab.methods.method import Piece
+from neuralq.lab.methods.record import Piece
 from neuralq_envs.counterexamples.hall import hall
 
 __all__ = ["figure_hall", "modal_sweeps", "predicted_sweeps", "sweeps_until"]

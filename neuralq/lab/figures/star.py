@@ -20,8 +20,8 @@ from neuralq.lab.linear.sampling import stream
 from neuralq.lab.methods import Method
 from neuralq.lab.methods import method as method_named
 from neuralq.lab.methods.emphatic import expected_emphatic_run
-from neuralq.lab.methods.method import Options
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.lab.methods.record import Options
 from neuralq.lab.trial import run
 from neuralq.lab.verdicts.moments import evolve
 from neuralq.lab.verdicts.update_maps import update_maps

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-from neuralq.lab.methods.method import Expected, Method, Option, SampledUpdate, flow
+from neuralq.lab.methods.record import Expected, Method, Option, SampledUpdate, flow
 
 __all__ = ["METHODS", "Expected", "Method", "Option", "SampledUpdate", "flow", "method"]
 

@@ -23,7 +23,7 @@ import numpy as np
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import chain_of, epsilon_greedy, greedy_values, pairs_of, visits_of
-from neuralq.lab.methods.method import Expected, Method, Option, Options, Piece
+from neuralq.lab.methods.record import Expected, Method, Option, Options, Piece
 from neuralq.types import Floats, Indices
 
 __all__ = ["Q_LEARNING", "SARSA", "piece_of_policy"]

@@ -22,8 +22,8 @@ from neuralq.checks import check_fraction
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import solve_chain
-from neuralq.lab.methods.method import LAMBDA, Expected, Method, Option, Options
 from neuralq.lab.methods.operators import ahead, traced_flow
+from neuralq.lab.methods.record import LAMBDA, Expected, Method, Option, Options
 from neuralq.lab.methods.trace import Trace, errors
 from neuralq.types import Floats
 

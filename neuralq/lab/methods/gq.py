@@ -20,8 +20,8 @@ from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import greedy_values, pairs_of
 from neuralq.lab.methods.gradient import corrected_flow, with_helpers
-from neuralq.lab.methods.method import LAMBDA, STEP_RATIO, Expected, Method, Options
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.lab.methods.record import LAMBDA, STEP_RATIO, Expected, Method, Options
 from neuralq.lab.methods.trace import Trace, dot
 from neuralq.types import Floats, Indices
 

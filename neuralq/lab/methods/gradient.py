@@ -31,8 +31,8 @@ import numpy as np
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
-from neuralq.lab.methods.method import LAMBDA, RIDGE, STEP_RATIO, Expected, Method, Options, flow
 from neuralq.lab.methods.operators import covariance, td
+from neuralq.lab.methods.record import LAMBDA, RIDGE, STEP_RATIO, Expected, Method, Options, flow
 from neuralq.lab.methods.trace import Trace, dot, errors
 from neuralq.types import Floats
 

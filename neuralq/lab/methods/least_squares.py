@@ -19,8 +19,8 @@ import numpy as np
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import Chain, chain_of, greedy_policy, pairs_of
-from neuralq.lab.methods.method import LAMBDA, RIDGE, Expected, Method, Options, Piece
 from neuralq.lab.methods.operators import ahead, covariance, cross, td
+from neuralq.lab.methods.record import LAMBDA, RIDGE, Expected, Method, Options, Piece
 from neuralq.lab.methods.trace import Trace
 from neuralq.types import Floats
 

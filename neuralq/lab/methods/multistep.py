@@ -21,8 +21,8 @@ import numpy as np
 
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
-from neuralq.lab.methods.method import LAMBDA, LARGEST, Expected, Method, Option, Options, flow
 from neuralq.lab.methods.operators import traced_flow
+from neuralq.lab.methods.record import LAMBDA, LARGEST, Expected, Method, Option, Options, flow
 from neuralq.lab.methods.trace import Trace, errors
 from neuralq.types import Floats
 

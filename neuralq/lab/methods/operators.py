@@ -11,7 +11,7 @@ import numpy as np
 from neuralq.exact import td_operator
 from neuralq.lab.linear.process import Process
 from neuralq.lab.methods.chains import Chain, solve_chain
-from neuralq.lab.methods.method import Expected, flow
+from neuralq.lab.methods.record import Expected, flow
 from neuralq.types import Floats
 
 __all__ = ["ahead", "covariance", "cross", "td", "traced_flow"]

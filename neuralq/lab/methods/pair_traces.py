@@ -19,8 +19,8 @@ from scipy import sparse
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
 from neuralq.lab.methods.chains import pairs_of
-from neuralq.lab.methods.method import LAMBDA, Expected, Method, Options, SampledUpdate
 from neuralq.lab.methods.operators import ahead, traced_flow
+from neuralq.lab.methods.record import LAMBDA, Expected, Method, Options, SampledUpdate
 from neuralq.lab.methods.trace import Trace
 from neuralq.types import Floats
 

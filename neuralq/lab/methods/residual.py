@@ -31,8 +31,8 @@ import numpy as np
 
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
-from neuralq.lab.methods.method import Expected, Method, Option, Options, flow
 from neuralq.lab.methods.operators import ahead, td
+from neuralq.lab.methods.record import Expected, Method, Option, Options, flow
 from neuralq.lab.methods.trace import errors
 from neuralq.types import Floats
 

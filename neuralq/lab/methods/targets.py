@@ -26,8 +26,8 @@ import numpy as np
 from neuralq.checks import check_whole
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
-from neuralq.lab.methods.method import LARGEST, RIDGE, Expected, Method, Option, Options, Piece
 from neuralq.lab.methods.operators import covariance, cross
+from neuralq.lab.methods.record import LARGEST, RIDGE, Expected, Method, Option, Options, Piece
 from neuralq.types import Floats
 
 __all__ = ["HARD_TARGET", "POLYAK_TARGET", "PROJECTED_TARGET", "frozen_target_map"]

@@ -14,8 +14,8 @@ import numpy as np
 
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import SampledTransition
-from neuralq.lab.methods.method import LAMBDA, RIDGE, Expected, Method, Options, flow
 from neuralq.lab.methods.operators import td
+from neuralq.lab.methods.record import LAMBDA, RIDGE, Expected, Method, Options, flow
 from neuralq.lab.methods.trace import Trace, errors
 from neuralq.types import Floats
 

@@ -26,7 +26,7 @@ from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.spectrum import flow_spectrum, moving_spectrum, visible_process
 from neuralq.lab.methods import Method
 from neuralq.lab.methods import method as method_named
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.lab.plain import fields_of
 from neuralq.types import Floats
 from neuralq_envs.counterexamples import Problem

@@ -34,7 +34,7 @@ from neuralq.lab.linear.spectrum import (
 )
 from neuralq.lab.methods import Expected, Method, flow
 from neuralq.lab.methods import method as method_named
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.lab.verdicts.moments import (
     growth_factors,
     mean_radius,

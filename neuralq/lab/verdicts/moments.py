@@ -30,7 +30,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.spectrum import moving_space, visible_process
 from neuralq.lab.methods import Method
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.lab.verdicts.update_maps import UpdateMaps, update_maps
 from neuralq.types import Floats, Indices
 from neuralq_envs.counterexamples import Problem

@@ -17,7 +17,7 @@ import numpy as np
 
 from neuralq.lab.linear.spectrum import limit_of, moving_spectrum
 from neuralq.lab.methods import Expected
-from neuralq.lab.methods.method import Piece
+from neuralq.lab.methods.record import Piece
 from neuralq.lab.verdicts.words import Region
 from neuralq.types import Floats
 

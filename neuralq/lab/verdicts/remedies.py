@@ -20,7 +20,7 @@ from neuralq.checks import check_positive
 from neuralq.lab.linear.process import linear_process
 from neuralq.lab.linear.spectrum import visible_process
 from neuralq.lab.methods import Method, method
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.lab.plain import fields_of
 from neuralq.lab.verdicts.critical import CRITICAL_PARAMETERS, scan
 from neuralq.lab.verdicts.diagnosis import Diagnosis, diagnose

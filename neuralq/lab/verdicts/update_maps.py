@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from neuralq.lab.linear.process import Process
 from neuralq.lab.linear.sampling import sample_along
 from neuralq.lab.methods import Method
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.types import Floats, Indices
 
 __all__ = ["UpdateMaps", "update_maps"]

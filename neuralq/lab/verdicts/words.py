@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.lab.linear.sampling import Sampling
-from neuralq.lab.methods.method import Options
+from neuralq.lab.methods.record import Options
 from neuralq.lab.plain import fields_of, plain
 from neuralq.types import Floats
 
