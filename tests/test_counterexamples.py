@@ -181,7 +181,7 @@ def test_star_spectral_radii(step_size: float, radii: tuple[float, ...]) -> None
 
 def test_star_1995_is_the_star_of_five_and_its_first_edition_ends() -> None:
     np.testing.assert_allclose(td(baird.star_1995())[0], td(baird.star(5))[0], atol=1e-15)
-    first = baird.star_first_edition()
+    first = baird.star_1995(termination=0.01)
     step, _ = chain(first, first.target_policy)
     np.testing.assert_allclose(step.sum(axis=1), [1, 1, 1, 1, 1, 0.99])
     assert slowest(first) < 0
@@ -387,7 +387,7 @@ def test_a_problem_refuses_what_makes_no_sense(change: dict[str, object], messag
         (lambda: chattering.chattering(-0.1), "exploration"),
         (lambda: walks.walk_off_policy("binary"), "features must be one of"),  # type: ignore[arg-type]
         (lambda: collision.collision(-1), "seed"),
-        (lambda: baird.star_first_edition(termination=2.0), "termination"),
+        (lambda: baird.star_1995(termination=2.0), "termination"),
         (lambda: baird.star_control(solid_probability=-1.0), "solid_probability"),
     ],
 )

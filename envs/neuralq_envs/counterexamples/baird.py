@@ -22,6 +22,7 @@ target policy visits (`star_on_policy`), a table (`star_tabular`), or less boots
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,6 @@ __all__ = [
     "star",
     "star_1995",
     "star_control",
-    "star_first_edition",
     "star_low_gamma",
     "star_on_policy",
     "star_tabular",
@@ -88,45 +88,43 @@ def star(num_upper: int = 6, gamma: float = 0.99) -> Problem:
     )
 
 
-def star_1995(num_upper: int = 5, gamma: float = 0.99) -> Problem:
+def star_1995(num_upper: int = 5, gamma: float = 0.99, termination: float = 0.0) -> Problem:
     """The star as Baird drew it: five upper states, one action, every transition trained equally often.
 
-    Raises:
-        ValueError: as `star`.
-
-    Example:
-        >>> problem = star_1995()
-        >>> problem.mdp.num_actions, problem.mdp.num_states
-        (1, 6)
-    """
-    problem = _one_action(star(num_upper, gamma), continuation=1.0)
-    return replace(
-        problem,
-        name="baird-1995",
-        title="Baird's star of 1995",
-        source="Baird 1995",
-        known=f"{problem.known} With n = 5 and γ = .99 the leading pair is complex: the values swing as they grow.",
-    )
-
-
-def star_first_edition(num_upper: int = 5, gamma: float = 0.99, termination: float = 0.01) -> Problem:
-    """The star in which the lower state ends the episode with a small probability.
+    Args:
+        num_upper: n.
+        gamma: γ.
+        termination: probability that the lower state ends the episode: .01 is the star of Sutton & Barto 1998.
 
     Raises:
         ValueError: as `star`, or ``termination`` outside [0, 1].
 
     Example:
-        >>> star_first_edition().mdp.termination.round(12).tolist()
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.01]
+        >>> star_1995().mdp.num_actions, star_1995(termination=0.01).mdp.termination.round(12).tolist()
+        (1, [0.0, 0.0, 0.0, 0.0, 0.0, 0.01])
     """
     check_fraction("termination", termination)
-    return replace(
-        _one_action(star(num_upper, gamma), continuation=1.0 - termination),
-        name="baird-first-edition",
-        title="Baird's star with an end",
-        source="Sutton & Barto 1998, figure 8.12",
-        known="An end with probability .01 does not help: expected TD(0) still diverges with n = 5 and γ = .99.",
+    problem = star(num_upper, gamma)
+    size = num_upper + 1
+    transition = np.zeros((size, size))
+    transition[:, -1] = 1.0
+    transition[-1, -1] = 1.0 - termination
+    names = problem.mdp.state_names
+    model = FiniteMDP.from_arrays(
+        [transition], np.zeros((size, 1)), substochastic=True, state_names=names, action_names=("solid",)
     )
+    said: dict[str, Any] = {
+        "name": "baird-first-edition",
+        "title": "Baird's star with an end",
+        "source": "Sutton & Barto 1998, figure 8.12",
+        "known": "An end with probability .01 does not help: expected TD(0) still diverges with n = 5 and γ = .99.",
+    }
+    if termination == 0:
+        swings = "With n = 5 and γ = .99 the leading pair is complex: the values swing as they grow."
+        said = {"name": "baird-1995", "title": "Baird's star of 1995", "source": "Baird 1995",
+                "known": f"{problem.known} {swings}"}  # fmt: skip
+    only = np.ones((size, 1))
+    return replace(problem, mdp=model, target_policy=only, behaviour_policy=only, **said)
 
 
 def star_control(num_upper: int = 6, gamma: float = 0.99, solid_probability: float | None = None) -> Problem:
@@ -235,23 +233,6 @@ def star_low_gamma(gamma: float = 0.85) -> Problem:
         title="Baird's star with little bootstrapping",
         known="γ < 15/17: expected TD(0) converges to values of 0.",
     )
-
-
-def _one_action(problem: Problem, continuation: float) -> Problem:
-    """The target policy's moves as the only action, each state updated equally often; the lower state may end."""
-    size = problem.mdp.num_states
-    transition = np.zeros((size, size))
-    transition[:, -1] = 1.0
-    transition[-1, -1] = continuation
-    model = FiniteMDP.from_arrays(
-        [transition],
-        np.zeros((size, 1)),
-        substochastic=True,
-        state_names=problem.mdp.state_names,
-        action_names=("solid",),
-    )
-    only = np.ones((size, 1))
-    return replace(problem, mdp=model, target_policy=only, behaviour_policy=only)
 
 
 def critical_gamma(num_upper: int) -> float:

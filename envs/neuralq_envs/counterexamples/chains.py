@@ -29,11 +29,11 @@ def restarting_chain(mdp: FiniteMDP, policy: NDArray[np.float64]) -> sparse.csr_
         [[0.0, 1.0], [1.0, 0.0]]
     """
     weight = policy[mdp.s_tm1, mdp.a_tm1] * mdp.row_discount
-    lively = ~mdp.is_terminal
-    keep = sparse.diags_array(lively.astype(np.float64))
+    active = ~mdp.is_terminal
+    keep = sparse.diags_array(active.astype(np.float64))
     choose = sparse.csr_array((weight, (mdp.s_tm1, np.arange(mdp.num_rows))), shape=(mdp.num_states, mdp.num_rows))
     inside = sparse.csr_array(choose @ mdp.transition @ keep)
-    ended = np.where(lively, 1.0 - np.asarray(inside.sum(axis=1)).reshape(-1), 0.0)
+    ended = np.where(active, 1.0 - np.asarray(inside.sum(axis=1)).reshape(-1), 0.0)
     ended[np.abs(ended) < 1e-12] = 0.0
     again = sparse.csr_array(ended[:, None]) @ sparse.csr_array(mdp.start_distribution[None, :])
     return sparse.csr_array(inside + again)
@@ -67,7 +67,7 @@ def stationary_distribution(mdp: FiniteMDP, policy: NDArray[np.float64]) -> NDAr
 
 
 def _mixed(chain: sparse.csr_array) -> NDArray[np.float64] | None:
-    """The distribution that a chain comes to, by steps of the lazy chain (P + I)/2; None where it mixes too slowly.
+    """The limit distribution of a chain, by steps of the lazy chain (P + I)/2; None where it mixes too slowly.
 
     The factors of a large random graph would be almost dense; but such a graph mixes within some dozen steps.
     """

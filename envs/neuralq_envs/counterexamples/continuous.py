@@ -153,8 +153,8 @@ def reachable_mdp(
     while len(frontier):
         number = numbered + np.arange(len(frontier))
         numbered += len(frontier)
-        lively = ~model.is_goal(frontier)
-        steps = model.step(frontier[lively])
+        active = ~model.is_goal(frontier)
+        steps = model.step(frontier[active])
         flat = steps.successor.reshape(-1, steps.successor.shape[-1])
         on = ~(steps.ended.reshape(-1) & ~model.is_goal(flat))  # a failure leads nowhere, the goal is a state
         target = np.full(len(flat), -1, dtype=np.int64)
@@ -164,8 +164,8 @@ def reachable_mdp(
                 f"more than max_states={max_states} states can be reached from these {len(start)}; "
                 "start from fewer, or from points on a common grid of the step length"
             )
-        a = np.tile(np.arange(model.num_actions), int(lively.sum()))
-        rows.append((np.repeat(number[lively], model.num_actions), a, steps.cost.reshape(-1), target))
+        a = np.tile(np.arange(model.num_actions), int(active.sum()))
+        rows.append((np.repeat(number[active], model.num_actions), a, steps.cost.reshape(-1), target))
         frontier = _first_of_each(flat[on], target[on], numbered)
     s_tm1, a_tm1, cost, s_t = (np.concatenate(column) for column in zip(*rows, strict=True))
     leads = s_t >= 0

@@ -118,29 +118,29 @@ class Problem:
             raise ValueError("control needs features of state-action pairs, [S, A, d], got one row per state")
 
     def _check_numbers(self) -> None:
-        lively, legal = ~self.mdp.is_terminal, self.mdp.legal
+        active, legal = ~self.mdp.is_terminal, self.mdp.legal
         for field in ("features", "initial_weights"):
             if not np.isfinite(getattr(self, field)).all():
                 raise ValueError(f"{field} must be finite, got NaN or infinity")
         for field in ("target_policy", "behaviour_policy"):
             policy = getattr(self, field)
-            bad = np.argwhere(~(np.where(legal, policy >= 0, policy == 0)) & lively[:, None])
+            bad = np.argwhere(~(np.where(legal, policy >= 0, policy == 0)) & active[:, None])
             if bad.size:
                 s, a = bad[0]
                 raise ValueError(
                     f"{field}[{s}, {a}] must be a probability of a legal action (or 0), got {policy[s, a]}"
                 )
-            off = np.flatnonzero(lively & (np.abs(np.where(legal, policy, 0.0).sum(axis=1) - 1) > 1e-9))
+            off = np.flatnonzero(active & (np.abs(np.where(legal, policy, 0.0).sum(axis=1) - 1) > 1e-9))
             if off.size:
                 raise ValueError(f"{field} in {self.mdp.state_name(off[0])} must sum to 1, got {policy[off[0]].sum()}")
         d = self.state_distribution
-        bad_states = np.flatnonzero(~(d >= 0) | (~lively & (d != 0)))
+        bad_states = np.flatnonzero(~(d >= 0) | (~active & (d != 0)))
         if bad_states.size:
             s = bad_states[0]
             raise ValueError(f"state_distribution[{s}] must be at least 0 (and 0 at a terminal state), got {d[s]}")
         if abs(d.sum() - 1) > 1e-9:
             raise ValueError(f"state_distribution must sum to 1, got {d.sum()}")
-        seen = np.flatnonzero(~lively & (self.features.reshape(len(d), -1) != 0).any(axis=1))
+        seen = np.flatnonzero(~active & (self.features.reshape(len(d), -1) != 0).any(axis=1))
         if seen.size:
             raise ValueError(
                 f"features of the terminal {self.mdp.state_name(seen[0])} must be 0, for its value is 0 by definition; "
@@ -253,9 +253,9 @@ def _probabilities(mdp: FiniteMDP, policy: ArrayLike | None) -> Floats:
     given: NDArray[Any] = np.asarray(policy)
     if given.ndim == 1:
         table = np.zeros(legal.shape)
-        lively = np.flatnonzero(~mdp.is_terminal)
-        if len(given) != mdp.num_states or np.min(given[lively]) < 0 or np.max(given[lively]) >= mdp.num_actions:
+        active = np.flatnonzero(~mdp.is_terminal)
+        if len(given) != mdp.num_states or np.min(given[active]) < 0 or np.max(given[active]) >= mdp.num_actions:
             raise ValueError(f"a policy of actions must be [S] with actions in 0..{mdp.num_actions - 1}, got {given}")
-        table[lively, given[lively].astype(np.int64)] = 1.0
+        table[active, given[active].astype(np.int64)] = 1.0
         return table
     return np.asarray(given, dtype=np.float64)

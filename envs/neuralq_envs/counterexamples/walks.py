@@ -95,13 +95,13 @@ def walk_off_policy(features: WalkFeatures = "dependent", right: float = 0.6) ->
         action_names=("left", "right"),
     )
     table = _between_ends(tables[features])
-    lively = _between_ends(np.ones((5, 1)))
+    inside = _between_ends(np.ones((5, 1)))
     return Problem.from_mdp(
         model,
         table,
         gamma=1.0,
-        target_policy=lively * [1 - right, right],
-        behaviour_policy=lively * [0.5, 0.5],
+        target_policy=inside * [1 - right, right],
+        behaviour_policy=inside * [0.5, 0.5],
         initial_weights=np.zeros(table.shape[1]),
         step_size=0.05,
         name=f"walk-{features}",

@@ -40,7 +40,7 @@ class FittedDiagnosis:
 
     Args:
         verdict: ``"converges"``, ``"diverges"``, ``"drifts"`` (the same cost is added for ever), ``"chatters"``
-            (bounded, but the greedy policy never comes to rest), ``"unstable"`` (it came to rest where any error
+            (bounded, but the greedy policy never settles), ``"unstable"`` (it settled where any error
             grows, as symmetry allows; rounding drives it off later) or ``"undecided"`` (too few sweeps to tell).
         guaranteed: whether a certificate says so, for any start; otherwise it holds for the start that was run.
         averager: whether the regressor is an averager on this support; None if it is no linear smoother.

@@ -10,7 +10,7 @@ is y ← c_π + γ H_π y with the greedy policy π, and H_π takes from H the r
   with positive costs where the derived model can end from everywhere.
 * otherwise the greedy policy that the sweeps arrive at decides: as long as it stays, errors grow by the spectral radius
   of γ H_π. A radius above 1 is divergence, 1 is a drift (the same cost added for ever, no way to the goal), and a
-  policy that never comes to rest can keep the sweeps in a bounded cycle without any limit (chattering).
+  policy that never settles can keep the sweeps in a bounded cycle without any limit (chattering).
 
 The outcome may depend on the sampling set more than on the problem, and, without a certificate, on the start too.
 """

@@ -45,7 +45,7 @@ def least_phi(direct: Floats, residual: Floats, margin: float = 0.0) -> Floats:
     Args:
         direct: W_d.
         residual: W_rg.
-        margin: added where φ > 0, as far as 1.
+        margin: added where φ > 0, up to 1.
 
     Example:
         >>> against, down, along = np.array([[-1.0, 2.0]]), np.array([[1.0, 0.0]]), np.array([[5.0, 1.0]])

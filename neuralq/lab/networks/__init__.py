@@ -1,1 +1,1 @@
-"""What the lab says of networks: expected steps, tangent kernels and local verdicts."""
+"""Networks in the lab: expected steps, tangent kernels and local verdicts."""

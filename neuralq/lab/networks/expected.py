@@ -141,10 +141,10 @@ def _state_arrays(problem: Problem) -> tuple[NDArray[np.generic], ...]:
             "this problem has features of state-action pairs: give the representation one output per action"
         )
     P_pi, r_pi = policy_process(problem.mdp, problem.target_policy)
-    lively = ~problem.mdp.is_terminal[:, None]
+    active = ~problem.mdp.is_terminal[:, None]
     return (
         problem.state_distribution[:, None].copy(), r_pi[:, None], P_pi.toarray()[:, None, :],
-        np.ones_like(lively, dtype=np.float64), lively,
+        np.ones_like(active, dtype=np.float64), active,
     )  # fmt: skip
 
 

@@ -216,7 +216,7 @@ def _piecewise(case: _Case) -> Diagnosis:
     verdict: Verdict = "neutral" if path.outcome == "undecided" else path.outcome
     if settled and poor:
         verdict = "stable but poor fixed point"
-    if settled and radius >= 1 - NEUTRAL:  # it rests where it starts, to the last bit, on a point that holds nothing
+    if settled and radius >= 1 - NEUTRAL:  # it starts exactly on a fixed point that is not stable
         settled, verdict = False, "diverges" if radius > 1 + NEUTRAL else "neutral"
     bound = None
     if verdict not in ("chatters", "neutral"):

@@ -71,7 +71,7 @@ class _Walk:
         return np.array_equal(M, self.piece[0]) and np.array_equal(c, self.piece[1])
 
     def leap(self) -> int:
-        """As far as the piece stays, by doubling; how many doublings."""
+        """Apply the piece for as long as it stays, by doubling; the number of doublings."""
         power, theta = self.piece, self.theta
         before: Piece | None = None
         for k in range(MOST_LEAP):

@@ -3,7 +3,7 @@
 For an unstable problem every kind of remedy is tried at the same step size: more λ, longer returns, a penalty, a part
 of the residual gradient, a target network, a second time scale, another method, another distribution of updates. Of a
 parameter the smallest change that makes the expected update converge is found by a scan, and a tenth of the way on is
-recommended, because a run on the edge of stability takes for ever. A remedy is worth what its diagnosis says: how fast
+recommended, because a run on the edge of stability takes for ever. Remedies are ranked by their diagnosis: how fast
 the error shrinks, how far its fixed point lies from the true values, and whether single runs scatter without bound.
 """
 
