@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.film import Moment, caption, frame_rate, make_shown, picture, play, writers_for
+from neuralq.apps.cli.film import caption, frame_rate, make_shown, picture, play, writers_for
+from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.apps.cli.sweeps import single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.folder.run_folder import read_config
@@ -152,8 +151,7 @@ def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Name
     writers = writers_for(options.gif, options.mp4, rate)
     returns: list[float] = []
     try:
-        with _bar() as bar:
-            task = bar.add_task("film", total=options.episodes, text="")
+        with ProgressBar[tuple[int, str]](options.episodes, lambda report: Told(report[0], report[1:])) as bar:
             for moment in game:
                 image = picture(env.render(), caption(moment), options.width)
                 for _ in range(max(1, round(rate)) if moment.over else 1):  # the end stays for a second
@@ -161,8 +159,8 @@ def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Name
                         writer.add(image)
                 if moment.over:
                     returns.append(moment.episode_return)
-                _advance(bar, task, moment)
-            bar.update(task, text="writing")
+                bar((moment.episode - (not moment.over), caption(moment)))
+            bar((options.episodes, "writing"))
             for writer in writers:
                 writer.close()
     except BaseException:
@@ -170,13 +168,3 @@ def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Name
             writer.discard()
         raise
     return returns
-
-
-def _bar() -> Progress:
-    console = Console(stderr=True)
-    columns = (BarColumn(bar_width=24), TextColumn("{task.fields[text]}"))
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-
-
-def _advance(bar: Progress, task: Any, moment: Moment) -> None:
-    bar.update(task, completed=moment.episode - (not moment.over), text=caption(moment))

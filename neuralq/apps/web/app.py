@@ -17,7 +17,6 @@ from collections import OrderedDict
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -80,26 +79,15 @@ async def _answer(request: Request) -> Response:
     known: OrderedDict[str, Response] = request.app.state.remembered
     key = f"{kind} {spec}"
     if key not in known:
-        status, found = await _asked(request, kind, spec)
+        try:
+            status, found = await request.app.state.pool.ask(kind, spec, request.is_disconnected)
+        except (Busy, TooLong, Left) as error:
+            raise refusal(error) from None
+        except (ValueError, OSError) as error:  # the worker died in between: killed for its memory, for example
+            raise HTTPException(500, "the computation ended early; ask again") from error
         if status >= 500:
             raise HTTPException(status, found["error"])
         known[key] = JSONResponse(found, status)
         while len(known) > _MOST_REMEMBERED:
             known.popitem(last=False)
     return Response(known[key].body, known[key].status_code, media_type="application/json")
-
-
-async def _asked(request: Request, kind: str, spec: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    pool: Pool = request.app.state.pool
-    try:
-        return await pool.ask(kind, spec, request.is_disconnected)
-    except Busy:
-        raise HTTPException(503, "too many computations are waiting; try again in a moment") from None
-    except TooLong:
-        raise HTTPException(
-            504, f"this takes more than {pool.deadline_seconds:g} s; from Python it may take as long as it likes"
-        ) from None
-    except Left:
-        raise HTTPException(499, "who asked went away") from None
-    except (ValueError, OSError) as error:  # the worker died in between: killed for its memory, for example
-        raise HTTPException(500, "the computation ended early; ask again") from error

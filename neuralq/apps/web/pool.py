@@ -19,13 +19,19 @@ _LOOK_SECONDS = 0.2
 class Busy(Exception):
     """Too many requests are waiting."""
 
+    status = 503
+
 
 class TooLong(Exception):
     """The answer was not there in time."""
 
+    status = 504
+
 
 class Left(Exception):
     """Who asked went away."""
+
+    status = 499
 
 
 class Pool:
@@ -68,7 +74,7 @@ class Pool:
             Left: who asked went away.
         """
         if self._waiting >= self._most_waiting:
-            raise Busy
+            raise Busy("too many computations are waiting; try again in a moment")
         self._waiting += 1
         try:
             await self._free.acquire()
@@ -76,7 +82,7 @@ class Pool:
             self._waiting -= 1
         try:
             if await is_gone():  # a newer request took its place while it waited
-                raise Left
+                raise Left("who asked went away")
             worker = self._idle.pop() if self._idle else await self._start()
             return await self._talk(worker, json.dumps([kind, spec]), is_gone)
         finally:
@@ -105,10 +111,11 @@ class Pool:
         pause = min(_LOOK_SECONDS, self.deadline_seconds)
         while not (await asyncio.wait({reading}, timeout=pause))[0]:
             if loop.time() >= ends:
-                raise TooLong
+                seconds = f"{self.deadline_seconds:g} s"
+                raise TooLong(f"this takes more than {seconds}; from Python it may take as long as it likes")
             if await is_gone():
                 if not (await asyncio.wait({reading}, timeout=_GRACE_SECONDS))[0]:
-                    raise Left
+                    raise Left("who asked went away")
                 return
 
     async def _start(self) -> asyncio.subprocess.Process:
