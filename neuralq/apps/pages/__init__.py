@@ -1,1 +1,1 @@
-"""What the chapter, reports and pages of the lab draw with: a page of claims and pictures, as text and as SVG."""
+"""What the chapter, ``neuralq solve`` and the demo draw with: a page of claims and pictures, as text and as SVG."""
