@@ -105,8 +105,8 @@ def test_it_trains_or_is_refused(layout: str, learner: str, kind: str) -> None:
         assert bool(torch.isfinite(flat).all()) and session.learner.num_updates > 0
         # Frozen Lake may not have paid within 200 steps; then a table that starts at 0 has nothing to learn.
         assert not torch.equal(before, flat) or (kind == "discrete" and layout in ("table", "linear"))
-        evaluated = session.evaluate(1, seed=0, max_steps=30)
-        assert len(evaluated.returns) == 1
+        session.evaluation_episodes, session.evaluation_max_steps = 1, 30
+        assert len(session.play_greedily(0).returns) == 1
     finally:
         session.close()
 

@@ -124,7 +124,8 @@ def test_evaluations_see_what_the_learner_sees_and_teach_nothing() -> None:
             for sample in session.experience.draw():
                 session.learner.update(sample.transition)
         before = {name: value.copy() for name, value in session.stream.normalisation.state_dict().items()}
-        session.evaluate(2, 3, 100)
+        session.evaluation_episodes, session.evaluation_max_steps = 2, 100
+        session.play_greedily(3)
         for name, value in session.stream.normalisation.state_dict().items():
             np.testing.assert_array_equal(value, before[name])
         session.evaluation_stream.restart(7)
@@ -195,7 +196,8 @@ def learned(seed: int, num_steps: int, **settings: Any) -> float:
             session.experience.add(session.stream.step(session.policy))
             for sample in session.experience.draw():
                 session.learner.update(sample.transition, sample.weight)
-        return session.evaluate(20, 1, 500).mean
+        session.evaluation_episodes, session.evaluation_max_steps = 20, 500
+        return session.play_greedily(1).mean
     finally:
         session.close()
 
