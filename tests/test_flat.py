@@ -37,6 +37,7 @@ def test_parameters_and_gradients_are_views_in_order(name: str) -> None:
     start = 0
     for p in q.parameters():
         end = start + p.numel()
+        assert flat.offset(p) == start
         assert p.detach().reshape(-1).tolist() == list(range(start, end))
         assert p.grad.reshape(-1).tolist() == [-float(i) for i in range(start, end)]
         assert p.data_ptr() == flat.values.data_ptr() + start * flat.values.element_size()

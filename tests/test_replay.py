@@ -417,14 +417,14 @@ def good() -> dict[str, Any]:
         ({"r_t": torch.zeros(2, 1)}, r"r_t must have shape \(2,\), got \(2, 1\)"),
         ({"r_t": torch.zeros(2, dtype=torch.int64)}, "r_t must be float32 or float64, got int64"),
         ({"last_t": torch.zeros(2)}, "last_t must be bool, got float32"),
-        ({"environments": np.array([0, 2])}, r"environments must lie in \[0, 2\), got 0 to 2"),
-        ({"environments": np.array([0.0, 1.0])}, "environments must be a row of int64"),
+        ({"env_indices": np.array([0, 2])}, r"env_indices must lie in \[0, 2\), got 0 to 2"),
+        ({"env_indices": np.array([0.0, 1.0])}, "env_indices must be a row of int64"),
     ],
 )
 def test_wrong_steps_are_refused_and_not_stored(change: dict[str, Any], message: str) -> None:
     buffer = ReplayBuffer(10, (2,), np.float32, num_envs=2)
     values = good() | change
-    env_indices = values.pop("environments", None)
+    env_indices = values.pop("env_indices", None)
     with pytest.raises(ValueError, match=message):
         buffer.add(Transition(**values), env_indices)
     assert len(buffer) == 0
@@ -437,7 +437,7 @@ def test_a_wrong_single_step_is_refused() -> None:
         buffer.add_step(0, s, 0, 1.0, 0.0, 1.0, s.astype(np.float64), False)
     with pytest.raises(ValueError, match=r"s_tm1 must have shape \(1, 2\), got \(1, 3\)"):
         buffer.add_step(0, np.zeros(3, np.float32), 0, 1.0, 0.0, 1.0, s, False)
-    with pytest.raises(ValueError, match="environments must lie"):
+    with pytest.raises(ValueError, match="env_indices must lie"):
         buffer.add_step(1, s, 0, 1.0, 0.0, 1.0, s, False)
     assert len(buffer) == 0
 

@@ -49,9 +49,9 @@ class ReplayBuffer:
     time limit keeps its bootstrap.
 
     Args:
-        capacity: steps to hold over all environments, rounded up to a multiple of ``num_envs``. Observations above 1
-        KiB get
-            9/8 rows per step; a stream whose episodes are shorter than 8 steps then holds somewhat fewer (`len`).
+        capacity: steps to hold over all environments, rounded up to a multiple of ``num_envs``. Observations above
+            1 KiB get 9/8 rows per step; a stream whose episodes are shorter than 8 steps then holds somewhat fewer
+            (`len`).
         observation_shape: shape of one observation; ``()`` for a number.
         observation_dtype: any NumPy dtype without objects: ``np.float32``, ``np.uint8``, ``np.int64``, ...
         num_envs: number of parallel environments.
@@ -146,7 +146,7 @@ class ReplayBuffer:
         return int(self._cursors[:, 1].sum())
 
     def add(self, transition: Transition, env_indices: Indices | None = None) -> None:
-        """Copies one step of each of ``environments`` (default: all, in order), or ``[T, k]`` steps, time first.
+        """Copies one step of each environment in ``env_indices`` (default: all), or ``[T, k]`` steps, time first.
 
         Args:
             transition: fields ``[k]`` or ``[T, k]``; tensors, or arrays (which is quicker for few steps).
@@ -385,11 +385,11 @@ class ReplayBuffer:
         env_indices: Indices = np.ascontiguousarray(given)
         if env_indices.ndim != 1 or env_indices.dtype != np.int64:
             raise ValueError(
-                f"environments must be a row of int64, got shape {env_indices.shape} of {env_indices.dtype}"
+                f"env_indices must be a row of int64, got shape {env_indices.shape} of {env_indices.dtype}"
             )
         if env_indices.size and not (env_indices.min() >= 0 and env_indices.max() < self.num_envs):
             raise ValueError(
-                f"environments must lie in [0, {self.num_envs}), got {env_indices.min()} to {env_indices.max()}"
+                f"env_indices must lie in [0, {self.num_envs}), got {env_indices.min()} to {env_indices.max()}"
             )
         return env_indices
 

@@ -42,7 +42,7 @@ _memcmp: Any = types.ExternalFunction("memcmp", types.int32(types.voidptr, types
 def _put(records: Any, rows: Any, cursors: Any, env_index: int, s_tm1: Any, s_t: Any) -> int:
     """Observations of a step into the environment's rows, its record's place out; evicts what the ring no longer holds.
 
-    ``cursors[environment]``: steps stored so far, steps held, rows written so far, unmarked breaks.
+    ``cursors[env_index]``: steps stored so far, steps held, rows written so far, unmarked breaks.
     """
     capacity, num_rows, size = records.shape[1], rows.shape[1], rows.shape[2]
     count, held, written = cursors[env_index, 0], cursors[env_index, 1], cursors[env_index, 2]
