@@ -26,6 +26,7 @@ import torch
 from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
+import neuralq_envs
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
@@ -152,27 +153,50 @@ def test_a_tree_shares_nothing_with_its_environment() -> None:
 
 FORMER_NAMES = {
     "neuralq_envs.rendering.RenderedEnv": "neuralq_envs.drawn.DrawnEnv",
-    "neuralq.mdp.environment.ModelEnv": "neuralq.simulate.ModelEnv",
-    "neuralq.mdp.model.FiniteMDP": "neuralq.mdp.FiniteMDP",
+    "neuralq.mdp.environment.": "neuralq.simulate.",
+    "neuralq.mdp.sampler.": "neuralq.simulate.",
+    "neuralq.mdp.outcomes.": "neuralq.simulate.",
+    "neuralq.mdp.model.": "neuralq.mdp.",
+    "neuralq.runs.stream.vector_env.SubEnv": "neuralq.interact.lanes.Lane",
+    "neuralq.runs.stream.encoding.": "neuralq.features.",
 }
+"""As of 0.3.1: where classes that stand in the state were, before they were moved."""
 
 
-def with_former_names(node: Any) -> Any:
+def with_former_names(node: Any, seen: set[str]) -> Any:
     if isinstance(node, dict):
-        return {key: with_former_names(value) for key, value in node.items()}
+        return {key: with_former_names(value, seen) for key, value in node.items()}
     if isinstance(node, list | tuple):
-        return type(node)(map(with_former_names, node))
-    return FORMER_NAMES.get(node, node) if isinstance(node, str) else node
+        return type(node)(with_former_names(item, seen) for item in node)
+    for now, before in FORMER_NAMES.items():
+        if isinstance(node, str) and node.startswith(now):
+            seen.add(before)
+            return before + node.removeprefix(now)
+    return node
 
 
 def test_a_tree_that_knows_classes_by_former_names_is_restored() -> None:
+    neuralq_envs.register()
+    seen: set[str] = set()
     env, fresh = (gymnasium.make("neuralq/BlockingMaze-v0") for _ in range(2))
     env.reset(seed=3)
     ended = play(env, 5, np.random.default_rng(0))[-1]
-    tree = encode_env(env)
-    assert all(name in str(tree) for name in FORMER_NAMES)
-    restore_env(fresh, with_former_names(tree))
+    restore_env(fresh, with_former_names(encode_env(env), seen))
     assert equal(play(fresh, 50, np.random.default_rng(1), ended), play(env, 50, np.random.default_rng(1), ended))
+    model = FiniteMDP.garnet(5, 2, 2, seed=0)
+    makers = (
+        lambda: make_vector_env(model.as_env, 2),
+        lambda: make_vector_env(lambda: gymnasium.make("CartPole-v1"), 2),
+        lambda: model.as_vector_env(3, max_episode_steps=4),
+    )
+    for make in makers:
+        saved, restored = make(), make()
+        saved.reset(seed=3)
+        saved.step(np.zeros(saved.num_envs, np.int64))
+        restore_env(restored, with_former_names(encode_env(saved), seen))
+        actions = np.ones(saved.num_envs, np.int64)
+        np.testing.assert_array_equal(saved.step(actions)[0], restored.step(actions)[0])
+    assert seen == set(FORMER_NAMES.values())
 
 
 def test_the_sampling_of_the_action_space_goes_on_where_it_was() -> None:
@@ -425,42 +449,3 @@ def test_another_construction_is_refused() -> None:
     for foreign in ({}, {"snapshot": 2}, {"snapshot": 1}, {"snapshot": 1, "root": {"kind": "object"}}):
         with pytest.raises(NotCopyable):
             restore_env(gymnasium.make("CartPole-v1"), foreign)
-
-
-def test_a_state_that_an_earlier_version_wrote_is_restored() -> None:
-    # As of 0.3.1: where classes that stand in the state were, before they were moved.
-    moved = {
-        "neuralq.runs.stream.vector_env.SubEnv": "neuralq.interact.lanes.Lane",
-        "neuralq.runs.stream.encoding.": "neuralq.features.",
-        "neuralq.mdp.model.": "neuralq.mdp.",
-        "neuralq.mdp.environment.": "neuralq.simulate.",
-        "neuralq.mdp.sampler.": "neuralq.simulate.",
-        "neuralq.mdp.outcomes.": "neuralq.simulate.",
-    }
-    seen: set[str] = set()
-
-    def as_before(node: Any) -> Any:
-        if isinstance(node, list | tuple):
-            return type(node)(map(as_before, node))
-        if isinstance(node, dict):
-            return {key: as_before(value) for key, value in node.items()}
-        for now, before in moved.items():
-            if isinstance(node, str) and node.startswith(now):
-                seen.add(before)
-                return before + node.removeprefix(now)
-        return node
-
-    model = FiniteMDP.garnet(5, 2, 2, seed=0)
-    makers = (
-        lambda: make_vector_env(model.as_env, 2),
-        lambda: make_vector_env(lambda: gymnasium.make("CartPole-v1"), 2),
-        lambda: model.as_vector_env(3, max_episode_steps=4),
-    )
-    for make in makers:
-        saved, fresh = make(), make()
-        saved.reset(seed=3)
-        saved.step(np.zeros(saved.num_envs, np.int64))
-        restore_env(fresh, as_before(encode_env(saved)))
-        actions = np.ones(saved.num_envs, np.int64)
-        np.testing.assert_array_equal(saved.step(actions)[0], fresh.step(actions)[0])
-    assert seen == set(moved.values())
