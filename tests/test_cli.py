@@ -215,6 +215,13 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_preset(tmp_pa
         assert merged["body"] == preset["body"]
 
 
+def test_small_numbers_of_a_runs_configuration_are_numbers(tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps({"env": "CartPole-v1", "reward_scale": 1e-05}))
+    assert "1e-05" in file.read_text()  # which YAML takes for a word
+    assert configuration(capsys, ["--config", str(file)])["reward_scale"] == 1e-05
+
+
 def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> None:
     for layout in ("table", "linear"):
         assert configuration(capsys, ["CartPole-v1", "--layout", layout])["body"] is None

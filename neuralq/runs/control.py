@@ -60,11 +60,6 @@ class Run:
     resumability: str
     engine: str
 
-    @property
-    def trained(self) -> str:
-        """How much training there was, in words."""
-        return f"{self.env_steps:,} environment steps"
-
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
         return {**dataclasses.asdict(self), "run_dir": str(self.run_dir)}
@@ -73,8 +68,8 @@ class Run:
         """The same for people."""
         score = "not evaluated" if self.greedy_return is None else f"greedy return {self.greedy_return:.1f}"
         return [
-            f"{self.trained}, {self.cpu_seconds:.2f} CPU-seconds of training, {self.wall_seconds:.2f} seconds in all; "
-            f"{score}"
+            f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
+            f"{self.wall_seconds:.2f} seconds in all; {score}"
         ]
 
 

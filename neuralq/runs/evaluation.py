@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -36,6 +37,30 @@ class Evaluation:
     def mean(self) -> float:
         """Mean return."""
         return float(np.mean(self.returns))
+
+    @property
+    def standard_error(self) -> float | None:
+        """Of `mean`; None of one episode."""
+        count = len(self.returns)
+        return float(np.std(self.returns, ddof=1) / np.sqrt(count)) if count > 1 else None
+
+    def plain(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        plain = {"greedy_return": self.mean, "standard_error": self.standard_error, "returns": list(self.returns)}
+        return {**plain, "lengths": list(self.lengths), "num_cut": self.num_cut}
+
+    def lines(self) -> list[str]:
+        """The same for people."""
+        error = "" if self.standard_error is None else f" ± {self.standard_error:.2f} (standard error)"
+        lines = [
+            f"mean return {self.mean:.2f}{error} over {len(self.returns)} episodes",
+            "lowest {:.1f}, quartiles {:.1f} {:.1f} {:.1f}, highest {:.1f}".format(
+                *np.percentile(self.returns, [0, 25, 50, 75, 100])
+            ),
+        ]
+        if self.num_cut:
+            lines.append(f"{self.num_cut} episodes were cut off: the environment did not end them")
+        return lines
 
 
 def evaluate_greedy(

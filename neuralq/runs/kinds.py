@@ -32,23 +32,8 @@ KINDS = {
 class Result(Protocol):
     """The result of a run."""
 
-    @property
-    def run_dir(self) -> Path:
-        """Its folder."""
-        ...
-
-    @property
-    def interrupted_by(self) -> str | None:
-        """Name of the signal that ended it early, or None."""
-        ...
-
     def plain(self) -> dict[str, Any]:
-        """The same as plain values, for JSON."""
-        ...
-
-    @property
-    def trained(self) -> str:
-        """How much training there was, in words."""
+        """Plain values, for JSON; among them ``run_dir``, ``env_steps`` and ``interrupted_by``."""
         ...
 
     def lines(self) -> list[str]:
@@ -119,14 +104,7 @@ class Kind(Generic[C, T, R]):
     command: CommandLine | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
-        """Train as configured and leave a run folder: configuration, versions, metrics and checkpoints.
-
-        Raises:
-            ValueError: for settings that do not go together.
-            RunFolderError: if the folder already holds a run.
-            EnvironmentFault: if the environment breaks its contract while training.
-            Diverged: if the parameters stop being finite.
-        """
+        """As `neuralq.train`."""
         path = self.default_path(config) if run_dir is None else Path(run_dir)
         refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
         plain, seed = self.to_plain(config), self.plan(config).seed
@@ -135,11 +113,9 @@ class Kind(Generic[C, T, R]):
                 return self._finish(config, trainee, Progress(), folder, hooks)
 
     def resume(self, run_dir: str | Path, budget: int | None = None, hooks: Sequence[Hook] = ()) -> R:
-        """Go on with a run from its newest valid checkpoint, or from the start if it was stopped before the first.
+        """As `neuralq.resume`.
 
         Raises:
-            RunFolderError: if there is no run, or another process is writing it.
-            CheckpointError: if no checkpoint is intact.
             ValueError: if the run is of another kind.
         """
         config = self.from_plain(read_config(run_dir))

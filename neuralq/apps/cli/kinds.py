@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import signal
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from neuralq.apps.cli import Failure, print_result
-from neuralq.apps.cli.options import add_fields, as_typed, hyphenated, read_options
+from neuralq.apps.cli.options import add_fields, as_typed, hyphenated, read_config_file, read_options
 from neuralq.apps.cli.progress import training_bar
 from neuralq.runs.folder.run_folder import read_config, refuse_old_run
 from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named
@@ -26,12 +25,15 @@ def say(line: str) -> None:
     print(f"neuralq: {line}", file=sys.stderr, flush=True)
 
 
-def conclude(run: Result, as_json: bool, plain: dict[str, Any], lines: Sequence[str]) -> int:
+def conclude(run: Result, as_json: bool, notes: Sequence[str] = (), **more: Any) -> int:
     """Prints the result of a run; the exit status says whether a signal ended it."""
-    if run.interrupted_by is not None:
-        say(f"{run.interrupted_by}: saved at {run.trained}; go on with: neuralq resume {run.run_dir}")
-    print_result(plain, as_json, lines)
-    return 0 if run.interrupted_by is None else 128 + signal.Signals[run.interrupted_by].value
+    plain, report = run.plain() | more, more.get("report")
+    signal_name, folder = plain["interrupted_by"], plain["run_dir"]
+    if signal_name is not None:
+        say(f"{signal_name}: saved at {plain['env_steps']:,} steps; go on with: neuralq resume {folder}")
+    lines = [*run.lines(), f"run folder {folder}" + ("" if report is None else f", report {report}")]
+    print_result(plain, as_json, [*lines, *notes])
+    return 0 if signal_name is None else 128 + signal.Signals[signal_name].value
 
 
 def train_kind(name: str, argv: Sequence[str]) -> int:
@@ -49,7 +51,7 @@ def train_kind(name: str, argv: Sequence[str]) -> int:
     say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
     with training_bar(kind, config) as bar:
         run = kind.train(config, path, [bar])
-    return conclude(run, as_json, run.plain(), [*run.lines(), f"run folder {run.run_dir}"])
+    return conclude(run, as_json)
 
 
 def resume_kind(name: str, options: argparse.Namespace) -> int:
@@ -65,7 +67,7 @@ def resume_kind(name: str, options: argparse.Namespace) -> int:
         raise Failure(_in_options(kind, str(error)), 2) from error
     with training_bar(kind, config) as bar:
         run = kind.resume(options.run, budget, [bar])
-    return conclude(run, options.json, run.plain(), [*run.lines(), f"run folder {run.run_dir}"])
+    return conclude(run, options.json)
 
 
 def new_budget(kind: Kind[Any, Any, Any], options: argparse.Namespace) -> int | None:
@@ -134,7 +136,7 @@ def _config(kind: Kind[Any, Any, Any], given: dict[str, Any]) -> Any:
     given = {name: [] if value == ["none"] else value for name, value in given.items()}
     try:
         plain: dict[str, Any] = (
-            {"kind": kind.name} if file is None else kind.to_plain(kind.from_plain(_read_file(file)))
+            {"kind": kind.name} if file is None else kind.to_plain(kind.from_plain(read_config_file(file)))
         )
         for place, settings in _parts(kind).items():
             own = {f.name: given.pop(f.name) for f in fields(settings) if f.name in given}
@@ -144,16 +146,6 @@ def _config(kind: Kind[Any, Any, Any], given: dict[str, Any]) -> Any:
         return kind.from_plain({**plain, **given})
     except ValueError as error:
         raise Failure(_in_options(kind, str(error)), 2) from error
-
-
-def _read_file(path: str) -> dict[str, Any]:
-    try:
-        content = json.loads(Path(path).read_bytes())
-    except (OSError, ValueError) as error:
-        raise Failure(f"cannot read --config {path}: {error}", 2) from error
-    if not isinstance(content, dict):
-        raise Failure(f"--config {path} must hold an object, got {type(content).__name__}", 2)
-    return content
 
 
 def _in_options(kind: Kind[Any, Any, Any], message: str) -> str:

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -29,7 +30,16 @@ from neuralq.runs.recipe.config import (
     fitted_value,
 )
 
-__all__ = ["TrainOptions", "add_fields", "as_typed", "hyphenated", "parse_train", "read_options", "train_parser"]
+__all__ = [
+    "TrainOptions",
+    "add_fields",
+    "as_typed",
+    "hyphenated",
+    "parse_train",
+    "read_config_file",
+    "read_options",
+    "train_parser",
+]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
@@ -179,15 +189,28 @@ def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list
     return known, file, rest
 
 
-def _read_file(path: str) -> dict[str, Any]:
+def read_config_file(path: str) -> dict[str, Any]:
+    """The mapping in a file of options, JSON or YAML.
+
+    Raises:
+        Failure: if it cannot be read or holds something else, with exit status 2.
+    """
     try:
-        with open(path, encoding="utf-8") as stream:
-            content = yaml.safe_load(stream)
+        text = Path(path).read_text(encoding="utf-8")
+        try:
+            content = json.loads(text)  # YAML 1.1 takes 1e-05 for a word
+        except ValueError:
+            content = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
     content = {} if content is None else content
     if not isinstance(content, dict):
         raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
+    return content
+
+
+def _read_file(path: str) -> dict[str, Any]:
+    content = read_config_file(path)
     known = [f.name for f in fields(RunConfig)]
     for name in content:
         if name not in known:

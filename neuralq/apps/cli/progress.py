@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from neuralq.runs.kinds import Kind
 
-__all__ = ["ProgressBar", "Told", "told_of_rows", "training_bar"]
+__all__ = ["ProgressBar", "Told", "training_bar"]
 
 _QUIET_SECONDS = 10.0
 """Where the output is no terminal: one line at most this often."""
@@ -94,38 +94,13 @@ class ProgressBar(Generic[T]):
             self._console.print(line, highlight=False, soft_wrap=True)
 
 
-def told_of_rows(
-    unit: str, total: int, notes: Callable[[Mapping[str, Any]], Sequence[str]]
-) -> Callable[[Mapping[str, Any]], Told]:
-    """What is said of rows of metrics: amount and rate, time left, and ``notes`` of the latest value of each column.
-
-    Example:
-        >>> tell = told_of_rows("games", 100, lambda latest: [f"win rate {latest['win_rate']}"])
-        >>> tell({"games": 50, "games_per_second": 5.0, "win_rate": 0.5}).amount
-        '50 of 100 games · 10 s left'
-    """
-    latest: dict[str, Any] = {}
-    things = unit.removeprefix("env_")
-
-    def tell(row: Mapping[str, Any]) -> Told:
-        latest.update({name: value for name, value in row.items() if value is not None})
-        so_far, rate = row[unit], latest.get(f"{things}_per_second", 0.0)
-        amount = f"{so_far:,} of {total:,} {things}"
-        if rate > 0:
-            seconds = max(total - so_far, 0) / rate
-            amount += f" · {seconds / 60:.0f} min left" if seconds >= 90 else f" · {seconds:.0f} s left"
-        return Told(so_far, [f"{rate:,.0f} {things}/s", *notes(latest)], amount)
-
-    return tell
-
-
 def training_bar(
     kind: Kind[Any, Any, Any],
     config: Any,
     stream: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> ProgressBar[Mapping[str, Any]]:
-    """The bar of a run, which is a hook.
+    """The bar of a run, which is a hook: amount and rate, time left, and what the kind of run has to say.
 
     Example:
         >>> import io
@@ -134,6 +109,16 @@ def training_bar(
         >>> with training_bar(CONTROL, RunConfig(), io.StringIO()) as bar:
         ...     bar({"kind": "train", "env_steps": 50, "steps_per_second": 10.0, "episode_return": None})
     """
-    plan = kind.plan(config)
-    tell = told_of_rows(plan.unit, plan.budget, lambda latest: kind.notes(config, latest))
+    plan, latest = kind.plan(config), dict[str, Any]()
+    things = plan.unit.removeprefix("env_")
+
+    def tell(row: Mapping[str, Any]) -> Told:
+        latest.update({name: value for name, value in row.items() if value is not None})
+        so_far, rate = row[plan.unit], latest.get(f"{things}_per_second", 0.0)
+        amount = f"{so_far:,} of {plan.budget:,} {things}"
+        if rate > 0:
+            seconds = max(plan.budget - so_far, 0) / rate
+            amount += f" · {seconds / 60:.0f} min left" if seconds >= 90 else f" · {seconds:.0f} s left"
+        return Told(so_far, [f"{rate:,.0f} {things}/s", *kind.notes(config, latest)], amount)
+
     return ProgressBar(plan.budget, tell, stream, clock)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from pathlib import Path
-
-import numpy as np
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
@@ -15,7 +14,7 @@ from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
-from neuralq.runs import Run, evaluate_run
+from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
@@ -44,14 +43,7 @@ def train(argv: list[str]) -> int:
     refuse_old_run(path)  # also by the run, but preparing takes seconds
     origin = started_from(config, options)
     say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
-    with contextlib.ExitStack() as stack:
-        hooks: list[Hook] = []
-        if options.tensorboard:
-            hooks.append(stack.enter_context(contextlib.closing(TensorBoard(path / "tensorboard"))))
-        if options.wandb:
-            hooks.append(stack.enter_context(contextlib.closing(WeightsAndBiases(path, config_to_dict(config)))))
-        hooks += _own(options.hook, stack)
-        hooks.append(stack.enter_context(training_bar(CONTROL, config)))
+    with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
         run = CONTROL.train(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
@@ -80,30 +72,30 @@ def resume(argv: list[str]) -> int:
     if options.workers is not None:
         raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
     config = config_from_dict(read_config(options.run))
-    board = Path(options.run) / "tensorboard"
-    with contextlib.ExitStack() as stack:
-        hooks: list[Hook] = []
-        if board.is_dir():  # the run was started with --tensorboard
-            hooks.append(stack.enter_context(contextlib.closing(TensorBoard(board))))
-        if (Path(options.run) / "wandb").is_dir():  # with --wandb
-            tracker = WeightsAndBiases(options.run, config_to_dict(config))
-            hooks.append(stack.enter_context(contextlib.closing(tracker)))
-        hooks += _own(options.hook, stack)
-        planned = config if total_steps is None else CONTROL.with_budget(config, total_steps)
-        hooks.append(stack.enter_context(training_bar(CONTROL, planned)))
-        run = CONTROL.resume(options.run, total_steps, hooks)
+    path, planned = Path(options.run), config if total_steps is None else CONTROL.with_budget(config, total_steps)
+    board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
+    with _hooks(path, planned, board, tracker, options.hook) as hooks:
+        run = CONTROL.resume(path, total_steps, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
 
-def _own(name: str | None, stack: contextlib.ExitStack) -> list[Hook]:
-    """The user's own hook, if there is one, closed at the end if it can be."""
-    if name is None:
-        return []
-    hook = own_hook(name)
-    close = getattr(hook, "close", None)
-    if callable(close):
-        stack.callback(close)
-    return [hook]
+@contextlib.contextmanager
+def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: str | None) -> Iterator[list[Hook]]:
+    """The hooks of a run, the bar last; closed at the end where they can be."""
+    wanted: list[Callable[[], Hook]] = []
+    if tensorboard:
+        wanted.append(lambda: TensorBoard(path / "tensorboard"))
+    if wandb:
+        wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
+    if own is not None:
+        wanted.append(lambda: own_hook(own))
+    with contextlib.ExitStack() as stack:
+        hooks = []
+        for make in wanted:
+            hooks.append(make())
+            if callable(close := getattr(hooks[-1], "close", None)):
+                stack.callback(close)
+        yield [*hooks, stack.enter_context(training_bar(CONTROL, config))]
 
 
 def evaluate(argv: list[str]) -> int:
@@ -125,26 +117,8 @@ def evaluate(argv: list[str]) -> int:
     parser.add_argument("--best", action="store_true", help="play with the best parameters of the run, not the last")
     options = parser.parse_args(argv)
     result = evaluate_run(single_run(options.run), options.episodes, options.seed, options.best)
-    returns = np.array(result.returns)
-    error = float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None
-    quartiles = np.percentile(returns, [0, 25, 50, 75, 100])
-    plain = {
-        "greedy_return": result.mean,
-        "standard_error": error,
-        "returns": list(result.returns),
-        "lengths": list(result.lengths),
-        "num_cut": result.num_cut,
-        "run_dir": str(options.run),
-        "parameters": "best" if options.best else "newest",
-    }
-    lines = [
-        f"mean return {result.mean:.2f}" + ("" if error is None else f" ± {error:.2f} (standard error)")
-        + f" over {len(returns)} episodes",
-        "lowest {:.1f}, quartiles {:.1f} {:.1f} {:.1f}, highest {:.1f}".format(*quartiles),
-    ]  # fmt: skip
-    if result.num_cut:
-        lines.append(f"{result.num_cut} episodes were cut off: the environment did not end them")
-    print_result(plain, options.json, lines)
+    named = {"run_dir": str(options.run), "parameters": "best" if options.best else "newest"}
+    print_result({**result.plain(), **named}, options.json, result.lines())
     return 0
 
 
@@ -168,10 +142,10 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     if run.engine != "compiled" and not forced:
         say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")
     best = _best_return(run)
-    lines = [*run.lines(), f"run folder {run.run_dir}" + ("" if report_path is None else f", report {report_path}")]
+    notes = []
     if best is not None and run.greedy_return is not None and best > run.greedy_return:
-        lines.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
-    status = conclude(run, as_json, {**run.plain(), "best_return": best, "report": report_path}, lines)
+        notes.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
+    status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
         raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
     return status

@@ -136,9 +136,9 @@ def run_sweep(
         RunFolderBusy: if another process is running this sweep.
     """
     check_whole("num_workers", num_workers := num_cores() if num_workers is None else num_workers)
-    request, processes = StopRequest(), _Processes(sweep, command)
-    lock = FolderLock(sweep.path / "sweep.lock", f"the sweep in {sweep.path} is being run")
+    request, lock = StopRequest(), FolderLock(sweep.path / "sweep.lock", f"the sweep in {sweep.path} is being run")
     with contextlib.closing(lock), request.listening():
+        processes = _Processes(sweep, command)
         try:
             while processes.waiting or processes.running:
                 if request.name is not None:

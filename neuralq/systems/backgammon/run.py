@@ -31,7 +31,7 @@ from neuralq.systems.backgammon.network import ValueNetwork
 from neuralq.systems.backgammon.opponents import require_gnubg
 from neuralq.systems.backgammon.selfplay import SelfPlay
 
-__all__ = ["TD_GAMMON", "GammonRun", "GammonTrainee", "load_agent", "resume_games", "train_games"]
+__all__ = ["TD_GAMMON", "GammonRun", "load_agent", "resume_games", "train_games"]
 
 WEIGHTS_NAME = "weights.safetensors"
 _MOST_AT_ONCE = 200
@@ -62,11 +62,6 @@ class GammonRun:
     weights_sha256: str
     interrupted_by: str | None
 
-    @property
-    def trained(self) -> str:
-        """How much training there was, in words."""
-        return f"{self.games:,} games"
-
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
         return {"kind": KIND, **dataclasses.asdict(self), "run_dir": str(self.run_dir)}
@@ -75,7 +70,7 @@ class GammonRun:
         """The same for people."""
         rate = self.games / self.cpu_seconds if self.cpu_seconds > 0 else 0.0
         return [
-            f"{self.trained} in {self.cpu_seconds:.1f} CPU-seconds ({rate:,.0f} games per CPU-second), "
+            f"{self.games:,} games in {self.cpu_seconds:.1f} CPU-seconds ({rate:,.0f} games per CPU-second), "
             f"{self.wall_seconds:.1f} seconds in all",
             *(
                 f"against {name}: {points:+.3f} ± {error:.3f} points per game"
@@ -84,15 +79,8 @@ class GammonRun:
         ]
 
 
-class GammonTrainee:
-    """Self-play as the loop trains it; a `neuralq.runs.loop.Trainee` whose kernels are compiled.
-
-    Args:
-        config: what to run.
-
-    Raises:
-        MissingExtra: if pubeval or gnubg shall be played and gnubg-nn is not installed.
-    """
+class _Trainee:
+    """Self-play as `neuralq.runs.loop` trains it: counted in games, with turns for environment steps."""
 
     observed = None
 
@@ -108,21 +96,17 @@ class GammonTrainee:
 
     @property
     def amount(self) -> int:
-        """Games."""
         return self.learner.num_games
 
     @property
     def env_steps(self) -> int:
-        """Turns."""
         return int(self.learner.tally[3])
 
     def advance(self, until: int, request: StopRequest) -> None:
-        """Some games, in whole batches."""
         num_games = min(until - self.amount, _MOST_AT_ONCE)
         self.learner.play(self.config.whole_batches(max(num_games, 1)))
 
     def training_row(self) -> dict[str, Any]:
-        """What the games since the last row were like, and where the schedules stand."""
         self.require_finite()
         learner = self.learner
         plain, gammons, backgammons, turns = (learner.tally - np.array(self._logged)).tolist()
@@ -136,7 +120,6 @@ class GammonTrainee:
         }
 
     def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
-        """Points per game against each opponent."""
         self.require_finite()
         row: dict[str, Any] = {}
         for opponent in self.config.evaluate_against:
@@ -148,11 +131,6 @@ class GammonTrainee:
         return row, None
 
     def require_finite(self) -> None:
-        """Refuse weights that are no longer finite.
-
-        Raises:
-            Diverged: if they are not.
-        """
         if not np.isfinite(self.learner.network.flat).all():
             raise Diverged(
                 f"after {self.amount:,} games the weights are no longer finite: training diverged; nothing "
@@ -160,16 +138,14 @@ class GammonTrainee:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, dice, optimiser, and what the rows need."""
         return {"progress": {"points": self.points, "logged": self._logged}, "learner": self.learner.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
         self.learner.load_state_dict(state["learner"])
         self.points, self._logged = dict(state["progress"]["points"]), state["progress"]["logged"]
 
     def close(self) -> None:
-        """Nothing is held."""
+        pass
 
 
 def _plan(config: TdGammonConfig) -> Plan:
@@ -183,7 +159,7 @@ def _default_path(config: TdGammonConfig) -> Path:
     return default_run_path(KIND, layout, config.seed, datetime.now())
 
 
-def _result(config: TdGammonConfig, trainee: GammonTrainee, progress: Progress, folder: RunFolder) -> GammonRun:
+def _result(config: TdGammonConfig, trainee: _Trainee, progress: Progress, folder: RunFolder) -> GammonRun:
     network = trainee.learner.network
     notes = {"games": str(trainee.amount), "seed": str(config.seed), "mode": config.settings.mode}
     partial = folder.path / f".partial-{WEIGHTS_NAME}"
@@ -248,7 +224,7 @@ TD_GAMMON = Kind(
     from_plain=config_from_dict,
     default_path=_default_path,
     num_threads=lambda config: 1,  # the games share the cores; the optimiser's vectors are too short to
-    build=GammonTrainee,
+    build=_Trainee,
     plan=_plan,
     result=_result,
     load=_load,
@@ -301,18 +277,9 @@ def train_games(config: TdGammonConfig, run_dir: str | Path | None = None, hooks
 
 
 def resume_games(run_dir: str | Path, num_games: int | None = None, hooks: Sequence[Hook] = ()) -> GammonRun:
-    """Go on with a run from its newest intact checkpoint, or from the start if it was stopped before the first.
-
-    The continued run ends with the same bits as one that was never stopped.
-
-    Args:
-        run_dir: folder of the run.
-        num_games: a new budget; games beyond the schedules keep their last values.
-        hooks: called with every row of metrics.
+    """As `neuralq.resume`, with a new budget in games, of which those beyond the schedules keep their last values.
 
     Raises:
-        RunFolderError: if there is no run, or another process is writing it.
-        CheckpointError: if no checkpoint is intact.
         ValueError: the run is of another kind.
     """
     return TD_GAMMON.resume(run_dir, num_games, hooks)
