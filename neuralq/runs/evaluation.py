@@ -1,6 +1,6 @@
 """Greedy evaluation: the returns of a policy without exploration, on an environment of its own.
 
-The first episode of every environment counts and no other: taking whichever episodes finish first would favour short ones.
+The first episode of every environment counts and no other: taking whichever finish first would favour short ones.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from neuralq.runs.stream.acting import choose_greedy
 from neuralq.checks import check_whole
 from neuralq.runs.stream import Interaction
+from neuralq.runs.stream.acting import choose_greedy
 
 __all__ = ["Evaluation", "evaluate_greedy"]
 

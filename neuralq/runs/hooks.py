@@ -12,6 +12,7 @@ from neuralq.checks import MissingExtra
 
 __all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
 
+
 class TensorBoard:
     """Writes every number of every row into TensorBoard event files.
 

@@ -1,4 +1,4 @@
-"""What trains on a Gymnasium environment: a stream of experience, folded through a behaviour, a source and a learner."""
+"""What trains on a Gymnasium environment: a stream of experience, folded through behaviour, source and learner."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class NotCopyable(Exception):
 
 
 def encode_env(env: Any) -> dict[str, Any]:
-    """The state of ``env`` as a tree that shares no memory with it and that `neuralq.runs.folder.checkpoint.save` can store.
+    """The state of ``env`` as a tree that shares no memory with it and that a checkpoint can store.
 
     Args:
         env: a `gymnasium.Env` or `gymnasium.vector.VectorEnv` in this process, wrapped or not.

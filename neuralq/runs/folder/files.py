@@ -96,7 +96,7 @@ def write_durably(path: Path, text: str) -> None:
 
 
 def to_json(value: Mapping[str, Any], name: str) -> str:
-    """The text of a JSON file.
+    r"""The text of a JSON file.
 
     Raises:
         ValueError: if it holds NaN or an infinity, which JSON has no word for.
@@ -104,7 +104,7 @@ def to_json(value: Mapping[str, Any], name: str) -> str:
 
     Example:
         >>> to_json({"seed": 3}, "run")
-        '{\\n  "seed": 3\\n}\\n'
+        '{\n  "seed": 3\n}\n'
     """
     try:
         return json.dumps(dict(value), indent=2, allow_nan=False) + "\n"

@@ -11,8 +11,8 @@ their parent, however that ends: they hold the other end of a pipe (`stop_with_p
 
 from __future__ import annotations
 
-from neuralq.runs.sweep.processes import SeedResult, Status, SweepResult, num_cores, run_sweep, stop_with_parent
 from neuralq.runs.sweep.folder import Sweep, create_sweep, is_sweep_folder, open_sweep
+from neuralq.runs.sweep.processes import SeedResult, Status, SweepResult, num_cores, run_sweep, stop_with_parent
 
 __all__ = [
     "SeedResult",

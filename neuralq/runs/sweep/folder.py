@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import read_json, to_json, write_durably
+from neuralq.runs.folder.files import to_json, write_durably
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_summary
 
 __all__ = ["Sweep", "create_sweep", "has_finished", "is_sweep_folder", "open_sweep", "steps_so_far"]

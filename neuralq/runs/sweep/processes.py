@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuralq.runs.sweep.statistics import Estimate, estimate
 from neuralq.checks import check_whole
 from neuralq.runs.folder.files import FolderLock, to_json, write_durably
 from neuralq.runs.folder.run_folder import read_summary
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.sweep.folder import Sweep, has_finished, steps_so_far
+from neuralq.runs.sweep.statistics import Estimate, estimate
 
 __all__ = ["SeedResult", "Status", "SweepResult", "num_cores", "run_sweep", "stop_with_parent"]
 
