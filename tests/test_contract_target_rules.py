@@ -11,11 +11,12 @@ mean · double that chooses by the target network, believes the online one, or h
 without its bonus, its entropy or its own numbers, or by the online network · Peng's λ-returns for Watkins', and the
 reverse · each of retrace, tree backup and Harutyunyan's by each other, all by Watkins', with the maximum, or by the
 online network · time limits ignored by λ-returns, or one step in their place · expected Sarsa by the best action, by
-the online network, or with its quantiles averaged · compiled arrays that know Q-learning only · targets that are right,
-and an update that learns from others · rewards left unscaled · DQRC with a target network, without its correction, its
-pull to 0 or its second function, or made a Q-learning run · each refusal let through, a learned pair refused, a refusal
-in two lines, without a way out, or with one that leads back · a learner that takes the settings of another · "torch" or
-"compiled" asked for and the other used · a rule, a distribution or an engine added without a formula.
+the online network, or with its quantiles averaged · IQN with one draw of levels for both sides, or with fixed ones ·
+compiled arrays that know Q-learning only · targets that are right, and an update that learns from others · rewards left
+unscaled · DQRC with a target network, without its correction, its pull to 0 or its second function, or made a
+Q-learning run · each refusal let through, a learned pair refused, a refusal in two lines, without a way out, or with
+one that leads back · a learner that takes the settings of another · "torch" or "compiled" asked for and the other used
+· a rule, a distribution or an engine added without a formula.
 """
 
 from __future__ import annotations
@@ -140,12 +141,26 @@ def hidden(theta: Tensor, s: Tensor) -> Tensor:
     return torch.tanh(layer(theta[: (WIDTH + 1) * HIDDEN], s[..., :WIDTH].double()))
 
 
-def numbers_of(world: str, theta: Tensor, s: Tensor) -> Tensor:
-    """All K numbers of every action, ``[*n, A, K]``."""
+def numbers_of(world: str, theta: Tensor, s: Tensor, levels: Tensor | None = None) -> Tensor:
+    """All K numbers of every action, ``[*n, A, K]``; of IQN at the levels ``[*n, K]``."""
     if world == "table":
-        return theta.reshape(NUM_STATES, NUM_ACTIONS, -1)[s]
-    out = layer(theta[(WIDTH + 1) * HIDDEN :], hidden(theta, s))
-    return out.reshape(*out.shape[:-1], NUM_ACTIONS, -1)
+        numbers = theta.reshape(NUM_STATES, NUM_ACTIONS, -1)[s]
+        return numbers if levels is None else numbers @ cosines(levels).transpose(-1, -2)
+    units, (lower, upper) = hidden(theta, s), ((WIDTH + 1) * HIDDEN, (HIDDEN + 1) * NUM_ACTIONS)
+    if levels is None:
+        out = layer(theta[lower:], units)
+        return out.reshape(*out.shape[:-1], NUM_ACTIONS, -1)
+    embedded = torch.relu(layer(theta[lower + upper :], cosines(levels)))  # Dabney, Ostrovski et al. 2018, eq. 4
+    return layer(theta[lower : lower + upper], units[..., None, :] * embedded).transpose(-1, -2)
+
+
+def cosines(levels: Tensor) -> Tensor:
+    return torch.cos(torch.pi * torch.arange(64.0, dtype=torch.float64) * levels[..., None])
+
+
+def drawn_levels(cell: Cell, rng: Any) -> Tensor | None:
+    """Of one side of an update, ``[T, B, K]``; only IQN draws any."""
+    return torch.from_numpy(rng.random((T, B, NUM_ATOMS))) if cell.distribution == "iqn" else None
 
 
 def mean(distribution: str, numbers: Tensor) -> Tensor:
@@ -157,7 +172,9 @@ def mean(distribution: str, numbers: Tensor) -> Tensor:
 
 def values_of(world: str, distribution: str, theta: Tensor, s: Tensor) -> Tensor:
     """Action values ``[*n, A]``, −∞ where the mask says so."""
-    q = mean(distribution, numbers_of(world, theta, s))
+    midpoints = (torch.arange(32.0, dtype=torch.float64) + 0.5) / 32
+    levels = midpoints.expand(*s.shape[: 2 if world == "table" else -1], -1) if distribution == "iqn" else None
+    q = mean(distribution, numbers_of(world, theta, s, levels))
     return q.masked_fill(s[..., -NUM_ACTIONS:] == 0, -torch.inf) if world == "masked-network" else q
 
 
@@ -176,12 +193,12 @@ class Seen:
     atoms_t: Any
 
 
-def seen_through(cell: Cell, online: Tensor, target: Tensor) -> Seen:
+def seen_through(cell: Cell, online: Tensor, target: Tensor, levels: Tensor | None) -> Seen:
     t = block(cell.world)
     rows = [t.a_tm1, t.mu_tm1.double(), SCALE * t.r_t.double(), t.discount_t.double(), t.last_t]
     looks = [(target, t.s_tm1), (target, t.s_t), (online, t.s_t)]
     values = [values_of(cell.world, cell.distribution, theta, s) for theta, s in looks]
-    return Seen(*(x.numpy() for x in (*rows, *values, numbers_of(cell.world, target, t.s_t))))
+    return Seen(*(x.numpy() for x in (*rows, *values, numbers_of(cell.world, target, t.s_t, levels))))
 
 
 # The rules by their definitions, row by row.
@@ -318,13 +335,15 @@ DISTRIBUTION_SETTINGS: dict[str, dict[str, Any]] = {
     "none": {"loss": "squared"},
     "quantile": {"num_atoms": NUM_ATOMS},
     "categorical": {"num_atoms": NUM_ATOMS, **LIMITS},
+    "iqn": {"num_atoms": NUM_ATOMS},
 }
+QUANTILES = ("quantile", "iqn")
 FORMULAS: dict[tuple[str, str], Callable[[str, Seen, Row], Any]] = {
     **{(rule, "none"): one_step for rule in ("q_learning", "double", "expected_sarsa", "munchausen", "dqrc")},
     **{(rule, "none"): lambda_return for rule in ("peng", "watkins")},
     **{(rule, "none"): corrected_return for rule in ("retrace", "tree_backup", "harutyunyan")},
-    **{(rule, "quantile"): moved_quantiles for rule in ("q_learning", "double", "munchausen")},
-    ("expected_sarsa", "quantile"): drawn_quantiles,
+    **{(rule, kind): moved_quantiles for rule in ("q_learning", "double", "munchausen") for kind in QUANTILES},
+    **{("expected_sarsa", kind): drawn_quantiles for kind in QUANTILES},
     **{(rule, "categorical"): moved_categories for rule in ("q_learning", "double", "expected_sarsa")},
 }
 
@@ -417,25 +436,27 @@ def chances(cell: Cell, seen: Seen, targets: Tensor) -> Tensor:
     return torch.from_numpy(np.array(each))
 
 
-def loss(distribution: str, numbers: Tensor, targets: Tensor, likely: Tensor) -> Tensor:
-    """Of every row, from its K numbers ``[N, K]``."""
+def loss(distribution: str, numbers: Tensor, targets: Tensor, likely: Tensor, levels: Tensor | None) -> Tensor:
+    """Of every row, from its K numbers ``[N, K]``, those of IQN at the levels ``[N, K]``."""
     if distribution == "none":
         return 0.5 * (targets - numbers[:, 0]) ** 2
     if distribution == "categorical":
         return -(targets * torch.log_softmax(numbers, -1)).sum(-1)
     error = targets[:, None, :] - numbers[:, :, None]  # Dabney et al. 2018, eq. 10, with κ = 1
-    levels = torch.tensor([(2 * i + 1) / (2 * NUM_ATOMS) for i in range(NUM_ATOMS)], dtype=error.dtype)[:, None]
+    if levels is None:
+        levels = torch.tensor([(2 * i + 1) / (2 * NUM_ATOMS) for i in range(NUM_ATOMS)], dtype=error.dtype)
     huber = torch.where(error.abs() <= 1, 0.5 * error**2, error.abs() - 0.5)
-    return ((levels - (error < 0).double()).abs() * huber * likely[:, None, :]).sum(-1).sum(-1)
+    return ((levels[..., None] - (error < 0).double()).abs() * huber * likely[:, None, :]).sum(-1).sum(-1)
 
 
-def expected_step(cell: Cell, before: Learning, targets: Tensor, likely: Tensor) -> list[Tensor]:
+def expected_step(cell: Cell, before: Learning, targets: Tensor, likely: Tensor, levels: Tensor | None) -> list[Tensor]:
     """The parameters after one step of SGD, and after them those of DQRC's second function."""
     t = block(cell.world).map(lambda x: x.flatten(0, 1))
     theta, every = before.online.clone().requires_grad_(), torch.arange(T * B)
-    numbers = numbers_of(cell.world, theta, t.s_tm1)[every, t.a_tm1]
+    levels = None if levels is None else levels.flatten(0, 1)
+    numbers = numbers_of(cell.world, theta, t.s_tm1, levels)[every, t.a_tm1]
     if before.second is None:
-        each = loss(cell.distribution, numbers, targets, likely)
+        each = loss(cell.distribution, numbers, targets, likely, levels)
         return [before.online - RATE * torch.autograd.grad(each.mean(), theta)[0]]
     # Patterson et al. 2022: δ ∇Q − h γ ∇max Q' for the values, (δ − h) ∇h and a pull to 0 for h.
     second = before.second.clone().requires_grad_()
@@ -459,20 +480,24 @@ def check_learned(cell: Cell) -> None:
         pytest.fail(f"teach this test the rule {cell.rule!r} under distribution={cell.distribution!r}: a formula")
     before, t = learning_of(cell), rows_for(cell)
     learner = before.learner
-    seen = seen_through(cell, before.online, before.target)
+    draws = np.random.default_rng(9)
+    levels_t, levels_tm1 = (drawn_levels(cell, draws) for _ in range(2))
+    seen = seen_through(cell, before.online, before.target, levels_t)
     wanted = expected_targets(cell, seen)
     likely = chances(cell, seen, wanted)
     near = {"rtol": 0.0, "atol": EXACT[cell.world]}
+    learner.rng = np.random.default_rng(9)
     if cell.rule != "dqrc":  # its targets are only to be seen in an update
         got = learner.targets(t).double()
         assert got.shape == (*t.r_t.shape, *wanted.shape[1:])
         torch.testing.assert_close(got.reshape(wanted.shape), wanted, **near)
     several = wanted @ GRID if cell.distribution == "categorical" else (wanted * likely).sum(-1)
     aims = wanted if wanted.ndim == 1 else several
+    learner.rng = np.random.default_rng(9)
     update = learner.update(t)
     torch.testing.assert_close(update.targets.double(), aims, **near)
     after = [learner.engine.flat.values] + ([] if before.second is None else [learner.state_dict()["h"]])
-    for got, values in zip(after, expected_step(cell, before, wanted, likely), strict=True):
+    for got, values in zip(after, expected_step(cell, before, wanted, likely, levels_tm1), strict=True):
         torch.testing.assert_close(got.double(), values, **near)
 
 

@@ -27,7 +27,17 @@ from neuralq.learners import (
     learner_kinds,
 )
 from neuralq.learners.replay.buffer import ReplayBuffer
-from neuralq.q import MLP, ActionOutputQ, CategoricalQ, DuelingQ, LinearQ, MaskedQ, QuantileQ, TableQ
+from neuralq.q import (
+    MLP,
+    ActionOutputQ,
+    CategoricalQ,
+    DuelingQ,
+    ImplicitQuantileQ,
+    LinearQ,
+    MaskedQ,
+    QuantileQ,
+    TableQ,
+)
 from neuralq.q.compiled import MlpEngine, make_engine
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.runs import Run, RunConfig, load, resume, train
@@ -211,6 +221,10 @@ CASES: dict[str, dict[str, Any]] = {
     "munchausen": replay(target_rule="munchausen", target_period_updates=9),
     "expected sarsa": replay(target_rule="expected_sarsa", num_steps=2),
     "quantile": replay(distribution="quantile", target_rule="double", prioritised=True),
+    "iqn, prioritised": replay(distribution="iqn", num_atoms=4, prioritised=True, num_steps=2),
+    "iqn, separate": replay("separate", distribution="iqn", target_rule="double"),
+    "iqn, table": replay("table", distribution="iqn", target_rule="expected_sarsa") | {"env": "FrozenLake-v1"},
+    "munchausen iqn": replay("action-input", distribution="iqn", target_rule="munchausen"),
     "munchausen quantile, dueling": replay(distribution="quantile", target_rule="munchausen") | {"dueling": True},
     "categorical, n-step": replay(**C51, num_steps=3),
     "quantile, linear": replay("linear", distribution="quantile"),
@@ -236,7 +250,7 @@ def outcome(run: Run) -> tuple[Any, ...]:
     return run.parameters_sha256, run.env_steps, run.greedy_return
 
 
-QUICK = ("munchausen", "quantile", "categorical, n-step", "retrace", "dqrc")
+QUICK = ("munchausen", "quantile", "iqn, prioritised", "categorical, n-step", "retrace", "dqrc")
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.slow) for x in CASES])
@@ -261,6 +275,7 @@ def test_a_run_stopped_on_the_way_ends_with_the_same_bits(name: str, tmp_path: P
     [
         ("munchausen", ReplayLearner, ActionOutputQ),
         ("munchausen quantile, dueling", DistributionalLearner, QuantileQ),
+        ("iqn, prioritised", DistributionalLearner, ImplicitQuantileQ),
         ("categorical, table", DistributionalLearner, CategoricalQ),
         ("dqrc", DQRCLearner, None),
         ("dueling", ReplayLearner, DuelingQ),

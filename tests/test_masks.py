@@ -98,6 +98,8 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "munchausen": {"replay": ReplaySettings(**SINGLE, target_rule="munchausen")},
     "dqrc": {"replay": ReplaySettings(**DQRC, learning_rate=0.5, target_rule="dqrc", loss="squared")},
     "quantile": {"replay": ReplaySettings(**QUANTILE)},
+    "expected sarsa": {"replay": ReplaySettings(**SINGLE, target_rule="expected_sarsa")},
+    "iqn": {"replay": ReplaySettings(**SINGLE, distribution="iqn", num_atoms=4)},
     "quantile munchausen": {"replay": ReplaySettings(**QUANTILE, target_rule="munchausen")},
     "categorical": {
         "replay": ReplaySettings(**SINGLE, distribution="categorical", num_atoms=51, value_min=-20.0, value_max=80.0)

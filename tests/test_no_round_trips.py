@@ -54,6 +54,8 @@ CASES: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     *(("replay", {**REPLAY, **one}, {}) for one in (
         {}, {"target_rule": "double"}, {"target_rule": "munchausen"}, {"num_steps": 3}, {"prioritised": True},
         {"distribution": "quantile"}, {"distribution": "quantile", "prioritised": True},
+        {"target_rule": "expected_sarsa"}, {"target_rule": "expected_sarsa", "distribution": "quantile"},
+        {"distribution": "iqn"},
         BINS, {**BINS, "target_rule": "double", "prioritised": True}, {"loss": "squared"},
     )),
     ("replay", {**REPLAY, "distribution": "quantile"}, {"env": "Taxi-v4"}),

@@ -10,6 +10,7 @@ from neuralq.q.custom import Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
 from neuralq.q.flat import FlatParameters
+from neuralq.q.implicit import ImplicitQuantileQ
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
@@ -25,6 +26,7 @@ __all__ = [
     "Custom",
     "DuelingQ",
     "FlatParameters",
+    "ImplicitQuantileQ",
     "LinearQ",
     "MaskedQ",
     "QuantileQ",

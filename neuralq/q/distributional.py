@@ -8,6 +8,8 @@ K numbers of every action with `atoms`.
 
 from __future__ import annotations
 
+from typing import Any, Protocol, runtime_checkable
+
 import torch
 from torch import Tensor, nn
 
@@ -15,7 +17,7 @@ from neuralq.checks import check_whole
 from neuralq.q.masked import MaskedQ
 from neuralq.types import QFunction
 
-__all__ = ["CategoricalQ", "QuantileQ", "atoms", "distribution_of"]
+__all__ = ["CategoricalQ", "Distributional", "QuantileQ", "atoms", "distribution_of"]
 
 
 def _actions_of(inner: QFunction, num_atoms: int) -> int:
@@ -130,8 +132,23 @@ class CategoricalQ(nn.Module):
         return self.all(s).gather(-1, a[..., None])[..., 0]
 
 
-def distribution_of(q: QFunction) -> QuantileQ | CategoricalQ:
-    """The distribution that a Q-function is the mean of, without its mask.
+@runtime_checkable
+class Distributional(Protocol):
+    """A Q-function whose values are means of what it says of returns."""
+
+    num_actions: int
+
+    def outputs(self, s: Tensor) -> Tensor:
+        """The numbers that describe the return of every action, ``[*n, *obs] -> [*n, A, K]``."""
+        ...
+
+    def mean(self, outputs: Tensor) -> Tensor:
+        """What is expected of an action with these numbers, ``[*n, K] -> [*n]``."""
+        ...
+
+
+def distribution_of(q: QFunction) -> Any:
+    """The `Distributional` function that a Q-function is the mean of, without its mask.
 
     Raises:
         ValueError: if it is the mean of none.
@@ -142,13 +159,18 @@ def distribution_of(q: QFunction) -> QuantileQ | CategoricalQ:
         5
     """
     inner = q.inner if isinstance(q, MaskedQ) else q
-    if not isinstance(inner, QuantileQ | CategoricalQ):
+    if not isinstance(inner, Distributional):
         raise ValueError(f"{type(inner).__name__} has no distribution; wrap it in QuantileQ or CategoricalQ")
     return inner
 
 
-def atoms(q: QFunction, s: Tensor) -> Tensor:
+def atoms(q: QFunction, s: Tensor, levels: Tensor | None = None) -> Tensor:
     """The K outputs of every action, legal or not: ``[*n, *obs] -> [*n, A, K]``; a mask in ``s`` is taken off.
+
+    Args:
+        q: a `Distributional` function, masked or not.
+        s: observations.
+        levels: ``[*n, K]`` for a function that takes levels; None for its own.
 
     Raises:
         ValueError: if ``q`` is the mean of no distribution.
@@ -159,4 +181,6 @@ def atoms(q: QFunction, s: Tensor) -> Tensor:
         >>> atoms(q, torch.tensor([[2, 1, 0], [1, 1, 1]])).shape
         torch.Size([2, 2, 5])
     """
-    return distribution_of(q).outputs(q.observation(s) if isinstance(q, MaskedQ) else s)
+    described, s = distribution_of(q), q.observation(s) if isinstance(q, MaskedQ) else s
+    outputs: Tensor = described.outputs(s) if levels is None else described.outputs(s, levels)
+    return outputs

@@ -2,8 +2,9 @@
 
 What the target rule follows in the successor is decided by the *means*, and every represented value z of it, by the
 target copy, becomes r + γ z. What is made of these is said in `neuralq.learners.replay.distributions`: `QuantileQ`
-regresses its values on them (QR-DQN, Dabney et al. 2018), `CategoricalQ` takes their projection on its grid for labels
-(C51, Bellemare, Dabney & Munos 2017).
+regresses its values on them (QR-DQN, Dabney et al. 2018), `ImplicitQuantileQ` its values at levels drawn anew (IQN,
+Dabney, Ostrovski, Silver & Munos 2018), `CategoricalQ` takes their projection on its grid for labels (C51, Bellemare,
+Dabney & Munos 2017).
 
 What is reported as an error is the difference of the means; priorities are made of it as well.
 """
@@ -21,7 +22,7 @@ from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import Description, Moved, distributions
 from neuralq.learners.replay.settings import ReplaySettings
-from neuralq.q.distributional import distribution_of
+from neuralq.q.distributional import atoms, distribution_of
 from neuralq.q.engine import Engine, TorchEngine
 from neuralq.q.masked import MaskedQ
 from neuralq.rules import Seen
@@ -35,7 +36,7 @@ class DistributionalLearner:
     """Distributional Q-learning on samples ``[B]`` with a target network.
 
     Args:
-        engine: of the Q-function that describes distributions so (`QuantileQ`, `CategoricalQ`), masked or not.
+        engine: of a `QuantileQ`, an `ImplicitQuantileQ` or a `CategoricalQ`, masked or not.
         settings: how to learn; ``distribution`` must name that representation.
         reward_scale: rewards are multiplied by it, so values are too (and a categorical grid must be).
         rng: draws the levels of an update where the description has them drawn.
@@ -82,7 +83,7 @@ class DistributionalLearner:
     def _moved(self, transition: Transition) -> Moved:
         target, described = self._networks.network(target=True), self._described
         seen = Seen(transition, self.engine.all, self.reward_scale, self.settings.lambda_, self._options)
-        outputs_t = described.outputs(target, transition.s_t, self._levels(len(transition.a_tm1)))
+        outputs_t = atoms(target, transition.s_t, self._levels(len(transition.a_tm1)))
         assert self.settings.rule.follows is not None
         followed = self.settings.rule.follows(seen)
         return described.move(distribution_of(target), seen.r_t, seen.discount_t, outputs_t, followed)
@@ -91,7 +92,8 @@ class DistributionalLearner:
         """Levels ``[B, K]`` drawn for one side of an update, where they are drawn."""
         if self._described.levels is None or self.settings.num_atoms is None:
             return None
-        return self._described.levels(num_rows, self.settings.num_atoms, self.rng).to(self.engine.flat.values)
+        drawn = self._described.levels(num_rows, self.settings.num_atoms, self.rng)
+        return drawn.to(self.engine.flat.values.device, non_blocking=True)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One descent step on a batch; ``weight`` ``[B]`` multiplies each sample's loss."""
@@ -101,7 +103,7 @@ class DistributionalLearner:
             self.engine.q.check_legal(s, a, weight)
         moved, levels = self._moved(transition), self._levels(len(a))
         self.engine.flat.grad.zero_()
-        outputs = self._described.outputs(self.engine.q, s, levels)
+        outputs = atoms(self.engine.q, s, levels)
         outputs = outputs.gather(1, a[:, None, None].expand(-1, 1, outputs.shape[-1]))[:, 0]
         each, aim = self._described.loss(outputs, moved, levels), moved.mean()
         if weight is not None:
@@ -131,10 +133,11 @@ class DistributionalLearner:
 def _description_for(q: QFunction, settings: ReplaySettings) -> Description:
     """The description that the settings name, if it is that of ``q``."""
     learned, inner = settings.returns.description, distribution_of(q)
-    if learned is None or not isinstance(inner, learned.q_class) or settings.num_atoms != inner.num_atoms:
+    num_atoms = getattr(inner, "num_atoms", settings.num_atoms)  # where levels are drawn any number will do
+    if learned is None or not isinstance(inner, learned.q_class) or settings.num_atoms != num_atoms:
         known = [x.name for x in distributions().values() if x.description and isinstance(inner, x.description.q_class)]
         raise ValueError(
             f"settings with distribution={settings.distribution!r} and num_atoms={settings.num_atoms} do not go "
-            f"with a {', '.join(known)} representation of {inner.num_atoms} atoms; make them alike"
+            f"with a {', '.join(known)} representation of {num_atoms} atoms; make them alike"
         )
     return learned

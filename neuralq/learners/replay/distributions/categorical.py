@@ -10,7 +10,6 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.learners.replay.distributions.record import Description, Distribution, Moved
 from neuralq.q import CategoricalQ
-from neuralq.q.distributional import atoms
 from neuralq.types import QFunction
 
 __all__ = ["CATEGORICAL"]
@@ -36,7 +35,7 @@ CATEGORICAL = Distribution(
     title="probabilities on a grid of values (C51)",
     source="Bellemare, Dabney & Munos 2017",
     losses=("cross_entropy",),
-    description=Description(CategoricalQ, lambda q, s, levels: atoms(q, s), _move, _loss),
+    description=Description(CategoricalQ, _move, _loss),
     num_atoms=51,
     least_atoms=2,
     bounded=True,

@@ -9,7 +9,6 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.learners.replay.distributions.record import Description, Distribution, Moved
 from neuralq.q import QuantileQ
-from neuralq.q.distributional import atoms
 
 __all__ = ["QUANTILE", "move_values", "quantile_loss"]
 
@@ -21,6 +20,7 @@ def move_values(q: Any, r_t: Tensor, discount_t: Tensor, outputs_t: Tensor, foll
 
 def quantile_loss(outputs_tm1: Tensor, moved: Moved, levels: Tensor | None) -> Tensor:
     """Quantile regression with Huber's parabola up to 1."""
+    levels = None if levels is None else levels.to(outputs_tm1.dtype)
     return rules.quantile_huber(outputs_tm1, moved.values, 1.0, levels, moved.probabilities)
 
 
@@ -29,7 +29,7 @@ QUANTILE = Distribution(
     title="equally likely values (QR-DQN)",
     source="Dabney et al. 2018",
     losses=("huber",),
-    description=Description(QuantileQ, lambda q, s, levels: atoms(q, s), move_values, quantile_loss),
+    description=Description(QuantileQ, move_values, quantile_loss),
     num_atoms=32,
     represent=lambda q, settings, reward_scale, rng: QuantileQ(q, settings.num_atoms),
     place=2,

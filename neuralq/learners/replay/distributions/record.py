@@ -43,14 +43,12 @@ class Description:
 
     Args:
         q_class: class of the Q-function.
-        outputs: ``outputs(q, s, levels)``: the numbers of every action ``[B, A, K]``; ``q`` may be masked.
         move: ``move(q, r_t, discount_t, outputs_t, followed) -> Moved``: the successor's distribution, moved by a step.
         loss: ``loss(outputs_tm1 [B, K], moved, levels)``: what is descended, ``[B]``.
         levels: ``levels(num_rows, num_atoms, rng)``: levels drawn for an update, ``[B, K]``; None where they are fixed.
     """
 
     q_class: type[Any]
-    outputs: Callable[[QFunction, Tensor, Tensor | None], Tensor]
     move: Callable[[Any, Tensor, Tensor, Tensor, Followed], Moved]
     loss: Callable[[Tensor, Moved, Tensor | None], Tensor]
     levels: Callable[[int, int, np.random.Generator], Tensor] | None = None
