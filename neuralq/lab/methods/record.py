@@ -78,22 +78,26 @@ class Option:
         """The largest value accepted."""
         return self.high if self.most is None else self.most
 
+    @property
+    def _smallest(self) -> float:
+        return self.low if self.least is None else self.least
+
     def accepts(self, value: float) -> bool:
         """Whether the option may have this value."""
         if self.special is not None and value == self.special:
             return True
-        low = self.low if self.least is None else self.least
-        inside = 0 < value <= self.largest if self.spacing == "log" else low <= value <= self.largest
+        inside = 0 < value <= self.largest if self.spacing == "log" else self._smallest <= value <= self.largest
         return inside and (self.spacing != "whole" or value == int(value))
 
     @property
     def range_text(self) -> str:
         """The values accepted, in words."""
-        kind = "a whole number" if self.spacing == "whole" else "a number"
-        low = "above 0" if self.spacing == "log" else f"from {self.low if self.least is None else self.least:g}"
-        or_special = "" if self.special is None else f" (or {self.special:g} for {self.special_label})"
-        high = "" if self.largest >= LARGEST else f" to {self.largest:g}"
-        return f"{kind} {low}{high}{or_special}"
+        kind, low = "a whole number" if self.spacing == "whole" else "a number", f"{self._smallest:g}"
+        if self.spacing == "log":
+            text = "above 0" if self.largest >= LARGEST else f"above 0, at most {self.largest:g}"
+        else:
+            text = f"of at least {low}" if self.largest >= LARGEST else f"from {low} to {self.largest:g}"
+        return f"{kind} {text}" + ("" if self.special is None else f" (or {self.special:g} for {self.special_label})")
 
     def plain(self) -> dict[str, Any]:
         """What a slider needs to know, for JSON."""

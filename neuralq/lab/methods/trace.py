@@ -30,25 +30,32 @@ class Trace:
     def advance(
         self,
         sample: SampledTransition,
-        after: Floats | float = 1.0,
-        before: Floats | float = 1.0,
-        fade: Floats | float = 1.0,
+        after: Floats | None = None,
+        before: Floats | None = None,
+        fade: Floats | None = None,
         x: Floats | None = None,
     ) -> Floats:
         """Take in the present row and return z, ``[N, d]``.
 
         Args:
             sample: the transitions.
-            after: multiplies all of the new trace, ``[N]``.
+            after: multiplies all of the new trace, ``[N]``; this and the next two by default not at all.
             before: multiplies what is left of the old one, ``[N]``.
             fade: multiplies what will be left of the new one, ``[N]``.
             x: what is taken in, ``[N, d]``; default: the features of the row.
         """
-        decay = np.where(sample.begins, 0.0, self._decay) * before
-        after = np.broadcast_to(after, len(self.z))
-        self.z = after[:, None] * (decay[:, None] * self.z + (sample.x if x is None else x))
-        self._decay = sample.discount * self._lambda * fade
-        return self.z
+        decay = np.where(sample.begins, 0.0, self._decay)
+        if before is not None:
+            decay *= before
+        z = decay[:, None] * self.z
+        z += sample.x if x is None else x
+        if after is not None:
+            z *= after[:, None]
+        self._decay = sample.discount * self._lambda
+        if fade is not None:
+            self._decay *= fade
+        self.z = z
+        return z
 
 
 def errors(w: Floats, sample: SampledTransition) -> Floats:
