@@ -6,7 +6,7 @@ moves along with the one it was meant for, and that is what decides whether trai
 """
 
 from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
-from neuralq.q.custom import Body, Custom
+from neuralq.q.custom import BODIES, Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
 from neuralq.q.flat import FlatParameters
@@ -16,6 +16,7 @@ from neuralq.q.masked import MaskedQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
 
 __all__ = [
+    "BODIES",
     "MLP",
     "NAMED_BODIES",
     "ActionInputQ",

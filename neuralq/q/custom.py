@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from neuralq.checks import check_choice, check_whole
 from neuralq.q.bodies import ACTIVATIONS, MLP, Conv, Trunk
 
-__all__ = ["Body", "Custom", "CustomStem", "Example"]
+__all__ = ["BODIES", "Body", "Custom", "CustomStem", "Example"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class Custom:
 
 
 Body = MLP | Conv | Custom
+BODIES: dict[str, Any] = {kind.__name__: kind for kind in get_args(Body)}
+"""By the name that configurations give them; a body of another kind is a class and its place in `Body`."""
 
 
 class CustomStem(nn.Module):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
-from neuralq.q import MLP, NAMED_BODIES, Body, Conv, Custom
+from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
 from neuralq.runs.recipe.games import is_screen
 
 __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict", "fitted_value"]
@@ -19,7 +19,6 @@ __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
-BODIES: dict[str, type[MLP] | type[Conv] | type[Custom]] = {"MLP": MLP, "Conv": Conv, "Custom": Custom}
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 _Class = TypeVar("_Class")
 
@@ -88,7 +87,7 @@ class RunConfig:
     epsilon_start: float = 1.0
     epsilon_end: float = 0.05
     epsilon_decay_steps: int = 20_000
-    body: MLP | Conv | Custom | None = None
+    body: Body | None = None
     dueling: bool = False
     if TYPE_CHECKING:  # which learners there are is found out when the program runs; type checkers know ours
         gradient: GradientSettings | None = None
@@ -162,7 +161,7 @@ def _check_body(config: RunConfig) -> None:
     if config.body is not None and config.layout not in NETWORKS:
         what = "table" if config.layout == "table" else "linear function"
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
-    if config.engine == "compiled" and (config.layout not in NETWORKS or isinstance(config.body, Conv | Custom)):
+    if config.engine == "compiled" and (config.layout not in NETWORKS or not isinstance(config.body or MLP(), MLP)):
         raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
 
 
