@@ -51,10 +51,6 @@ class Correction(Protocol):
         """Values and derivatives at N pairs, given Q there, with its graph, and ∇Q ``[N, d]``."""
         ...
 
-    def load(self, values: Tensor) -> None:
-        """Copy saved parameters in."""
-        ...
-
 
 class TangentCorrection:
     """h(s, a) = ∇Q(s, a)·h, from h = 0: the second weight vector of linear GTD2 and TDC, for any differentiable Q.
@@ -87,15 +83,6 @@ class TangentCorrection:
             curvature[i] = gradient(slope @ self.values, self._parameters)
         return Estimate(grad @ self.values, grad, curvature)
 
-    def load(self, values: Tensor) -> None:
-        """Copy saved parameters in."""
-        if values.shape != self.values.shape:
-            raise ValueError(
-                f"h has {self.values.numel()} entries here, the saved one has {values.numel()}; load it with the "
-                "network it was saved with"
-            )
-        self.values.copy_(values)
-
 
 class HeadCorrection:
     """h(s, a) by a function of its own, with one output for each action of Q.
@@ -114,15 +101,10 @@ class HeadCorrection:
     def __init__(self, head: QFunction) -> None:
         self.tangent = False
         self.head = head
-        self._flat = FlatParameters(cast(nn.Module, head))
-        self.values = self._flat.values
+        self.values = FlatParameters(cast(nn.Module, head)).values
         self._parameters = module_parameters(head)
 
     def estimate(self, s: Tensor, a: Tensor, q: Tensor, grad: Tensor) -> Estimate:
         """Values of the head and their gradients by its parameters."""
         h = self.head.at(s, a)
         return Estimate(h.detach(), gradient_rows(h, self._parameters), None)
-
-    def load(self, values: Tensor) -> None:
-        """Copy saved parameters in."""
-        self._flat.load(values)

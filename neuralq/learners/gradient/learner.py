@@ -19,8 +19,7 @@ action cuts it *before* its own gradient is added, it is dropped *after* the las
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -30,7 +29,7 @@ from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
 from neuralq.learners.learner import Update
-from neuralq.learners.traces.memory import restore, state_of
+from neuralq.learners.traces import memory
 from neuralq.q.compiled import MlpEngine
 from neuralq.q.engine import Engine
 from neuralq.types import Transition
@@ -79,6 +78,7 @@ class GradientPredictionLearner:
         self.settings = settings
         self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
+        self._memory = {"h": correction.values, "traces": self._core.traces}
 
     def increments(
         self, transition: Transition, rho_tm1: Tensor | None = None, weight: Tensor | None = None
@@ -117,18 +117,9 @@ class GradientPredictionLearner:
         self.num_updates += 1
         return seen
 
-    def begin_streams(self) -> None:
-        """Drop every trace."""
-        self._core.traces.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, those of h, traces and counters."""
-        return state_of(self, h=self._core.correction.values, traces=self._core.traces.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, traces=self._core.traces.state_dict())
-        self._core.correction.load(torch.as_tensor(state["h"]))
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict
 
 
 class GradientQLearner:
@@ -183,6 +174,7 @@ class GradientQLearner:
         self.policy = policy
         self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
+        self._memory = {"h": correction.values, "traces": self._core.traces}
 
     @property
     def engine_name(self) -> str:
@@ -228,15 +220,6 @@ class GradientQLearner:
         self.num_updates += 1
         return seen
 
-    def begin_streams(self) -> None:
-        """Drop every trace."""
-        self._core.traces.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, those of h, traces and counters."""
-        return state_of(self, h=self._core.correction.values, traces=self._core.traces.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, traces=self._core.traces.state_dict())
-        self._core.correction.load(torch.as_tensor(state["h"]))
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict

@@ -12,9 +12,7 @@ Bellman error. Even that may be small without the values being right (Sutton & B
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +21,7 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
-from neuralq.learners.traces.memory import restore, state_of
+from neuralq.learners.traces import memory
 from neuralq.q.engine import Engine
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import Transition
@@ -128,6 +126,7 @@ class ResidualGradientLearner:
         self._parameters = module_parameters(engine.q)
         self._direct = torch.zeros_like(engine.flat.values)
         self._residual = torch.zeros_like(engine.flat.values)
+        self._memory = {"direct": self._direct, "residual": self._residual}
 
     def _bootstrap(self, transition: Transition) -> Tensor:
         """γ times the value of the successor, with its graph, ``[B]``."""
@@ -187,13 +186,6 @@ class ResidualGradientLearner:
         self._residual.lerp_(residual, self.settings.trace_rate)
         return adaptive_phi(self._direct, self._residual)
 
-    def begin_streams(self) -> None:
-        """Nothing connects one sample to the next but the averages of φ, which streams share."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, averages and counters."""
-        return state_of(self, direct=self._direct, residual=self._residual)
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, direct=self._direct, residual=self._residual)
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict

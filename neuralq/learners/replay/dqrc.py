@@ -27,6 +27,7 @@ from neuralq.learners.gradient.correction import HeadCorrection
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners.traces.memory import copy_into
 from neuralq.q.bodies import Trunk
 from neuralq.q.compiled import MlpEngine
 from neuralq.q.engine import Engine
@@ -228,6 +229,6 @@ class DQRCLearner:
         """Continue from `state_dict`, bit for bit."""
         self.num_updates = int(state["num_updates"])
         self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        self._correction.load(torch.as_tensor(state["h"]))
+        copy_into({"h": self._correction.values}, state)
         self._state.load_state_dict(state["optimiser"])
         self._state_h.load_state_dict(state["optimiser_h"])

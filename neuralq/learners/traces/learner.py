@@ -8,9 +8,7 @@ the last step of a stream. With values held fixed over an episode the increments
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +17,8 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
-from neuralq.learners.traces.memory import Traces, restore, state_of
+from neuralq.learners.traces import memory
+from neuralq.learners.traces.memory import Traces
 from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
@@ -148,6 +147,7 @@ class OnlineLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, 1)
+        self._memory = {"traces": self._core.traces}
 
     def increment(self, transition: Transition, weight: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -169,17 +169,9 @@ class OnlineLearner:
         self.num_updates += 1
         return seen
 
-    def begin_streams(self) -> None:
-        """Drop every trace."""
-        self._core.traces.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, traces and counters."""
-        return state_of(self, traces=self._core.traces.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, traces=self._core.traces.state_dict())
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict
 
 
 class PredictionLearner:
@@ -212,6 +204,7 @@ class PredictionLearner:
         self.settings = settings
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, engine.q.num_actions)
+        self._memory = {"traces": self._core.traces}
 
     def increment(self, transition: Transition, rho_tm1: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -240,17 +233,9 @@ class PredictionLearner:
         self.num_updates += 1
         return seen
 
-    def begin_streams(self) -> None:
-        """Drop every trace."""
-        self._core.traces.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, traces and counters."""
-        return state_of(self, traces=self._core.traces.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, traces=self._core.traces.state_dict())
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict
 
 
 ONLINE = LearnerKind(

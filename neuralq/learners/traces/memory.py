@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Traces", "restore", "state_of"]
+__all__ = ["Traces", "begin_streams", "copy_into", "load_state_dict", "state_dict"]
 
 
 class Traces:
@@ -57,21 +57,45 @@ class Traces:
         return {**self.z, "decay": self.decay}
 
 
-def state_of(learner: Any, **memory: Any) -> dict[str, Any]:
-    """The state of a learner that moves its parameters itself: counter, parameters, and ``memory`` by its name."""
-    return {"num_updates": learner.num_updates, "parameters": learner.engine.flat.values, **memory}
+# Methods of learners that move their parameters themselves. What such a learner keeps beside them is in ``_memory`` by
+# name: tensors, or parts with `state_dict` and `clear`.
 
 
-def restore(learner: Any, state: Mapping[str, Any], **memory: Any) -> None:
-    """Copy a state made by `state_of` back into the learner and its ``memory``, tensors or mappings of tensors."""
-    learner.num_updates = int(state["num_updates"])
-    learner.engine.flat.load(torch.as_tensor(state["parameters"]))
-    _copy(memory, state)
+def begin_streams(self: Any) -> None:
+    """Every stream of experience starts anew: what connects one step to the next is dropped."""
+    for part in self._memory.values():
+        if not isinstance(part, Tensor):
+            part.clear()
 
 
-def _copy(mine: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
+def state_dict(self: Any) -> dict[str, Any]:
+    """Counter, parameters, and what is kept beside them: everything that a continued run needs."""
+    kept = {name: part if isinstance(part, Tensor) else part.state_dict() for name, part in self._memory.items()}
+    return {"num_updates": self.num_updates, "parameters": self.engine.flat.values, **kept}
+
+
+def load_state_dict(self: Any, state: Mapping[str, Any]) -> None:
+    """Continue from `state_dict`, bit for bit; a `ValueError` if the state belongs to another network."""
+    self.num_updates = int(state["num_updates"])
+    self.engine.flat.load(torch.as_tensor(state["parameters"]))
+    mine = self.state_dict()
+    copy_into({name: mine[name] for name in self._memory}, state)
+
+
+def copy_into(mine: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
+    """Copy saved tensors, in mappings or not, into those of the same name.
+
+    Raises:
+        ValueError: if a shape differs.
+    """
     for name, value in mine.items():
-        if isinstance(value, Tensor):
-            value.copy_(torch.as_tensor(saved[name]))
-        else:
-            _copy(value, saved[name])
+        if not isinstance(value, Tensor):
+            copy_into(value, saved[name])
+            continue
+        found = torch.as_tensor(saved[name])
+        if found.shape != value.shape:
+            raise ValueError(
+                f"{name} has {value.numel()} entries here, the saved one has {found.numel()}; load it with the "
+                "network it was saved with"
+            )
+        value.copy_(found)

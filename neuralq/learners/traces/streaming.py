@@ -17,7 +17,6 @@ and `StreamingLearner` is streaming TD(λ).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,8 +28,8 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
+from neuralq.learners.traces import memory
 from neuralq.learners.traces import streaming_kernels as kernels
-from neuralq.learners.traces.memory import restore, state_of
 from neuralq.q.engine import Engine
 from neuralq.q.single_row import SingleRowNetwork, runs_single_row
 from neuralq.rules import streaming as bounds
@@ -148,6 +147,10 @@ class _Steps:
         arguments: Any = (*self._memory, float(self._decay), delta, *self._constants, t)
         kernels.advance(*arguments)
 
+    def clear(self) -> None:
+        self.z.zero_()
+        self.decay.zero_()
+
     def state_dict(self) -> dict[str, Tensor]:
         state = {"z": self.z, "decay": self.decay, "means": self.means}
         return state if self.settings.bound == "obgd" else {**state, "v": self.v}
@@ -199,6 +202,7 @@ class StreamingLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._steps = _Steps(engine, settings, discount)
+        self._memory = {"steps": self._steps}
         self._compiled = kind != "torch" and on_cpu
         self._network = SingleRowNetwork(engine) if self._compiled and runs_single_row(engine.q) else None
 
@@ -271,18 +275,9 @@ class StreamingLearner:
         seen_both = torch.from_numpy(np.array([delta, target]))
         return Update(seen_both[:1], seen_both[1:])
 
-    def begin_streams(self) -> None:
-        """Drop the trace."""
-        self._steps.z.zero_()
-        self._steps.decay.zero_()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, trace, running means and counter."""
-        return state_of(self, steps=self._steps.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        restore(self, state, steps=self._steps.state_dict())
+    begin_streams = memory.begin_streams
+    state_dict = memory.state_dict
+    load_state_dict = memory.load_state_dict
 
 
 def _build(parts: Parts) -> StreamingLearner:
