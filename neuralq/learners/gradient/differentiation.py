@@ -49,9 +49,7 @@ def gradient(value: Tensor, parameters: Sequence[Tensor], differentiable: bool =
     """
     if not value.requires_grad:
         return _flatten([None] * len(parameters), parameters, ())
-    found = torch.autograd.grad(
-        value, parameters, retain_graph=True, create_graph=differentiable, allow_unused=True
-    )  # fmt: skip
+    found = torch.autograd.grad(value, parameters, retain_graph=True, create_graph=differentiable, allow_unused=True)
     return _flatten(found, parameters, ())
 
 
@@ -77,9 +75,14 @@ def gradient_rows(values: Tensor, parameters: Sequence[Tensor], differentiable: 
         return _flatten([None] * len(parameters), parameters, (len(values),))
     each = torch.eye(len(values), dtype=values.dtype, device=values.device)
     found = torch.autograd.grad(
-        values, parameters, each, retain_graph=True, create_graph=differentiable, allow_unused=True,
+        values,
+        parameters,
+        each,
+        retain_graph=True,
+        create_graph=differentiable,
+        allow_unused=True,
         is_grads_batched=True,
-    )  # fmt: skip
+    )
     return _flatten(found, parameters, (len(values),))
 
 

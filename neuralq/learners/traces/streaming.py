@@ -118,10 +118,8 @@ class _Steps:
         if values.device.type == "cpu":  # the same memory, as the kernels see it
             self._memory: Any = tuple(x.numpy() for x in (values, self.z, self.v, engine.flat.grad, self.means))
             self._decay: Any = self.decay.numpy()
-        self._constants: Any = (
-            _BOUNDS.index(settings.bound), settings.eta_or_alpha, settings.overshoot_bound,
-            settings.second_moment_decay, 1.0 - self.gamma_lambda,
-        )  # fmt: skip
+        alpha, kappa, beta2 = settings.eta_or_alpha, settings.overshoot_bound, settings.second_moment_decay
+        self._constants: Any = (_BOUNDS.index(settings.bound), alpha, kappa, beta2, 1.0 - self.gamma_lambda)
 
     def advance(self, delta: Tensor, t: int) -> None:
         """Decay the trace, add ``flat.grad`` and move the weights: step ``t``, from 1."""
