@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from neuralq.types import QFunction as QFunction
     from neuralq.types import Transition as Transition
 
-__version__ = "0.3.1"
+__version__ = "0.4.0"
 
 __all__ = [
     "ActionInputQ",
