@@ -65,7 +65,6 @@ def derived_mdp(sweep: Sweep) -> FiniteMDP:
     Source: Gordon 1995.
 
     Example:
-        >>> from neuralq.lab.fitted.iteration import sweep_of_mdp
         >>> mdp = FiniteMDP.from_arrays([[[0.5, 0.5], [0.0, 1.0]]], [[1.0], [0.0]])
         >>> derived_mdp(sweep_of_mdp(mdp, [0], [[1.0], [0.5]])).transition.toarray().tolist()
         [[0.75]]

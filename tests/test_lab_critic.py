@@ -87,7 +87,8 @@ def test_a_drift_has_no_safe_step_size_and_no_settled_scatter() -> None:
     for sampling in ("expected", "iid", "markov"):
         found = diagnose(problem, sampling=sampling)  # type: ignore[arg-type]
         assert found.verdict == "neutral" and found.drift > 0 and found.step_size_bound == 0.0
-        assert found.second_moment_radius in (None, 1.0)
+        radius = found.second_moment_radius
+        assert radius is None or radius == pytest.approx(1.0, abs=1e-14)  # LAPACK's last bit depends on the processor
         assert "drift" in found.explain()
         assert not re.search("settles|every step size below|No step size", found.explain())
 

@@ -222,7 +222,7 @@ class Watcher:
     def __init__(self) -> None:
         self.evaluation_parameters: dict[int, torch.Tensor] = {}
 
-    def look(self, learner: RolloutLearner, sample: object, /) -> None:
+    def observe(self, learner: RolloutLearner, sample: object, /) -> None:
         self._now = evaluation_parameters(learner).clone()
 
     def __call__(self, row: Mapping[str, Any], /) -> None:

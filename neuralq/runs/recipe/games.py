@@ -69,11 +69,8 @@ def refusals_name(env: str) -> Iterator[None]:
         ValueError: the environment is not registered, or its own code failed.
 
     Example:
-        >>> with refusals_name("neuralq/MitchelGrid-v0"):
-        ...     gym.make("neuralq/MitchelGrid-v0")
-        Traceback (most recent call last):
-        ...
-        ValueError: cannot make the environment 'neuralq/MitchelGrid-v0': ... Did you mean: `MitchellGrid`? ...
+        >>> with refusals_name("CartPole-v1"):
+        ...     _ = gym.make("CartPole-v1")
     """
     try:
         yield
