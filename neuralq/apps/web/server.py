@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuralq.apps.web.addresses import is_everywhere
 from neuralq.checks import MissingExtra, check_whole
 
 if TYPE_CHECKING:
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
 
     from neuralq.apps.web.play import Offer
 
-__all__ = ["LOOPBACK", "check_port", "lab_app", "need", "own_names", "play_app", "serve", "serve_app"]
+__all__ = ["check_port", "lab_app", "need", "play_app", "serve", "serve_app"]
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Names of this machine that no page of another site can take on."""
 
 
@@ -198,27 +198,7 @@ def _is_loopback(host: str) -> bool:
         return host.lower() == "localhost"
 
 
-def _is_everywhere(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        return host == ""
-
-
-def own_names(host: str) -> tuple[frozenset[str], bool]:
-    """The names that a page served on ``host`` answers to, in lower case, and whether to every number as well.
-
-    Example:
-        >>> sorted(own_names("10.0.0.7")[0]), own_names("10.0.0.7")[1]
-        (['10.0.0.7', '127.0.0.1', '::1', 'localhost'], False)
-    """
-    names = {*LOOPBACK, host.lower()}
-    if _is_everywhere(host):
-        names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-    return frozenset(names - {""}), _is_everywhere(host)
-
-
 def _address(host: str, port: int) -> str:
-    if _is_everywhere(host):
+    if is_everywhere(host):
         host = "127.0.0.1"
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"

@@ -23,7 +23,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Lifespan, Message, Receive, Scope, Send
 
-from neuralq.apps.web.server import own_names
+from neuralq.apps.web.addresses import own_names
 
 __all__ = ["HEADERS", "MAX_BODY_BYTES", "Guard", "Malformed", "read_body", "read_json", "refusal", "site"]
 
