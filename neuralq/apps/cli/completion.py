@@ -58,9 +58,12 @@ def _everything() -> argparse.ArgumentParser:
 def _add_train(to: argparse.ArgumentParser) -> None:
     """The options of every learner; a run takes those of its own."""
     from neuralq.apps.cli.options import train_parser
+    from neuralq.runs.kinds import KINDS
     from neuralq.runs.recipe.config import LEARNERS
 
-    to.add_argument("env", choices=[*_environments(), "td-gammon"], help="environment")
+    to.add_argument(
+        "env", choices=[*_environments(), *(kind for kind in KINDS if kind != "control")], help="environment"
+    )
     for learner in LEARNERS:
         _copy(train_parser(learner, {}), to)
 

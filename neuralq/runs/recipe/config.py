@@ -224,8 +224,8 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
         True
     """
     values = dict(plain)
-    if values.get("kind") == "td-gammon":
-        raise ValueError("this is the configuration of a TD-Gammon run; neuralq.systems.backgammon.config reads those")
+    if "kind" in values:
+        raise ValueError(f"this is the configuration of a run of the kind {values['kind']!r}, which acts in no environment")
     _refuse_unknown("the configuration", values, RunConfig)
     for name, kind in LEARNERS.items():
         if values.get(name) is not None:
