@@ -225,7 +225,7 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     """
     values = dict(plain)
     if "kind" in values:
-        raise ValueError(f"this is the configuration of a run of the kind {values['kind']!r}, which acts in no environment")
+        raise ValueError(f"this configures a run of the kind {values['kind']!r}, and not one on an environment")
     _refuse_unknown("the configuration", values, RunConfig)
     for name, kind in LEARNERS.items():
         if values.get(name) is not None:
