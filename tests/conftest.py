@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import settings
+
+gc.disable()  # until everything is collected: half of that time went into looking for garbage among what stays
 
 # The tests of a checkout test that checkout, whatever else is installed, and so do the processes that they start.
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,6 +34,13 @@ settings.load_profile("house")
 # Shapes: annotations of jaxtyping are checked by beartype in tests only. The hook has to be installed before the first
 # import of a module that it is to check, so it belongs here, above every import of neuralq:
 #     jaxtyping.install_import_hook(["neuralq.rules"], "beartype.beartype")
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is looked for, but not among what was collected."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -98,7 +98,7 @@ class ValueNetwork:
     def outputs(self, boards: Board) -> Array:
         """Chances ``[n, K]`` of the sides to move in boards ``[n, 2, 25]``; certainties where the game is over."""
         y = np.empty((len(boards), self.num_outputs), self.dtype)
-        evaluate(np.ascontiguousarray(boards, np.int8), self.w, self.v, self.c, self.scratch, y)
+        evaluate(np.require(boards, np.int8, ["C", "W"]), self.w, self.v, self.c, self.scratch, y)
         return y
 
     def copy(self) -> ValueNetwork:
