@@ -80,26 +80,27 @@ class _Core:
         weight: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What to add to the weights ``[d]``, and the errors of ``outputs``, all ``[N, k]``; the traces move on."""
-        z, v_old = self.traces.z["z"], self.traces.z["v_old"]
+        traces, v_old = self.traces.z["z"], self.traces.z["v_old"]
         total, errors = torch.zeros_like(self.engine.flat.values), torch.zeros_like(targets)
         for i in range(len(targets)):
             if weight is not None and weight[i] == 0:
                 continue
             if explored is not None:
-                z[i].masked_fill_(explored[i], 0.0)
-            for k in range(targets.shape[1]):
-                v_tm1 = self.engine.value_gradient(transition.s_tm1[i], outputs[i, k])
+                traces[i].masked_fill_(explored[i], 0.0)
+            row = zip(outputs[i], targets[i], errors[i], traces[i], v_old[i], strict=True)  # views, one per output
+            for output, target, error, z, before in row:
+                v_tm1 = self.engine.value_gradient(transition.s_tm1[i], output)
                 grad = self.engine.flat.grad
-                trace = self._grown(z[i, k], grad, self.traces.decay[i])
+                trace = self._grown(z, grad, self.traces.decay[i])
                 if rho_tm1 is not None:
                     # The ratio multiplies the whole trace, once: z = ρ(γλz + ∇V); the increment uses δ unweighted.
                     trace = rho_tm1[i] * trace
-                z[i, k] = trace
-                delta = targets[i, k] - v_tm1
-                errors[i, k] = delta
+                z.copy_(trace)
+                delta = target - v_tm1
+                error.copy_(delta)
                 if self.settings.trace == "dutch":
                     alpha = self.settings.step_size
-                    total += rules.true_online_increment(trace, grad, delta, v_tm1, v_old[i, k], alpha)
+                    total += rules.true_online_increment(trace, grad, delta, v_tm1, before, alpha)
                 else:
                     total += self.settings.step_size * delta * trace
             v_old[i] = v_t[i]
