@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from neuralq.learners import DQRCLearner, DQRCSettings, TwinHead
+from neuralq.learners import DQRCLearner, ReplaySettings, TwinHead
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, MaskedQ, SeparateQ, TableQ
 from neuralq.q.compiled import make_engine
 from neuralq.q.engine import Loss
@@ -24,6 +24,11 @@ from neuralq.types import Transition
 
 Array = NDArray[np.float64]
 NETWORKS: dict[str, Any] = {"action-input": ActionInputQ, "separate": SeparateQ, "action-output": ActionOutputQ}
+
+
+def settings(learning_rate: float = 1e-3, rate_h: float = 1e-3, beta: float = 1.0, **given: Any) -> ReplaySettings:
+    named = {"learning_rate": learning_rate, "dqrc_learning_rate": rate_h, "dqrc_beta": beta}
+    return ReplaySettings(**{"target_rule": "dqrc", "max_grad_norm": None, **named, **given})
 
 
 def column(values: Any) -> Tensor:
@@ -67,7 +72,7 @@ def test_with_linear_features_it_is_tdrc_on_the_mean_of_the_batch() -> None:
     rng = np.random.default_rng(1)
     phi = rng.normal(size=(5, 2, 4))
     engine = make_engine(FeatureQ(phi), Loss())
-    chosen = DQRCSettings(learning_rate=0.05, learning_rate_h=0.1, beta=0.5, optimiser="sgd")
+    chosen = settings(learning_rate=0.05, rate_h=0.1, beta=0.5, optimiser="sgd")
     learner = DQRCLearner(engine, FeatureQ(phi), chosen, reward_scale=2.0)
     theta, h = np.zeros(4), np.zeros(4)
     for _ in range(60):
@@ -91,7 +96,7 @@ def test_the_direction_on_a_network_sample_by_sample(layout: str) -> None:
     engine = make_engine(network(layout, 1), Loss())
     q: Any = engine.q
     head = TwinHead(q)
-    learner = DQRCLearner(engine, head, DQRCSettings(1.0, 1.0, beta=0.5, optimiser="sgd"))
+    learner = DQRCLearner(engine, head, settings(1.0, 1.0, beta=0.5, optimiser="sgd"))
     h: Tensor = learner.state_dict()["h"]
     randomise(h, 2)
     t = random_rows(7, seed=3)
@@ -146,7 +151,7 @@ def test_the_twin_of_a_masked_or_convolutional_network_and_of_none() -> None:
 def test_a_saved_learner_goes_on_bit_for_bit() -> None:
     def build(seed: int) -> DQRCLearner:
         engine = make_engine(network("action-output", seed), Loss())
-        return DQRCLearner(engine, TwinHead(engine.q), DQRCSettings(0.01, 0.02, max_grad_norm=0.5))
+        return DQRCLearner(engine, TwinHead(engine.q), settings(0.01, 0.02, max_grad_norm=0.5))
 
     one, two = build(1), build(2)
     for seed in range(5):
@@ -177,7 +182,7 @@ def test_on_bairds_control_star_q_learning_diverges_and_dqrc_does_not() -> None:
     for rate_h in (1e-12, 0.1):
         engine = make_engine(FeatureQ(phi), Loss())
         engine.flat.values.copy_(column(start))
-        learner = DQRCLearner(engine, FeatureQ(phi), DQRCSettings(0.1, rate_h, optimiser="sgd"))
+        learner = DQRCLearner(engine, FeatureQ(phi), settings(0.1, rate_h, optimiser="sgd"))
         for _ in range(600):
             learner.update(rows)
         worst[rate_h] = float(np.abs(phi @ engine.flat.values.numpy()).max())
@@ -186,12 +191,14 @@ def test_on_bairds_control_star_q_learning_diverges_and_dqrc_does_not() -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match="learning_rate_h"):
-        DQRCSettings(learning_rate_h=0.0)
-    with pytest.raises(ValueError, match="beta"):
-        DQRCSettings(beta=-1.0)
+    with pytest.raises(ValueError, match="dqrc_learning_rate"):
+        settings(rate_h=0.0)
+    with pytest.raises(ValueError, match="dqrc_beta"):
+        settings(beta=-1.0)
+    with pytest.raises(ValueError, match="learns by target_rule='dqrc', got 'double'; use ReplayLearner"):
+        DQRCLearner(make_engine(TableQ(2, 2), Loss()), TableQ(2, 2), ReplaySettings(target_rule="double"))
     with pytest.raises(ValueError, match="max_grad_norm"):
-        DQRCSettings(max_grad_norm=0.0)
+        settings(max_grad_norm=0.0)
     engine = make_engine(network("separate", 1), Loss())
     with pytest.raises(ValueError, match="weight must have the shape"):
-        DQRCLearner(engine, TwinHead(engine.q), DQRCSettings()).update(random_rows(3, 0), torch.ones(2))
+        DQRCLearner(engine, TwinHead(engine.q), settings()).update(random_rows(3, 0), torch.ones(2))

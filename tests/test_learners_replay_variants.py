@@ -20,7 +20,6 @@ import torch
 from neuralq.learners import (
     DistributionalLearner,
     DQRCLearner,
-    DQRCSettings,
     Parts,
     ReplayLearner,
     ReplaySettings,
@@ -387,7 +386,7 @@ def test_an_illegal_action_is_refused_where_it_counts_and_harmless_where_it_does
 
 def test_dqrc_and_linear_functions_refuse_illegal_actions_too() -> None:
     q = MaskedQ(LinearQ(2, 3), (2,))
-    learner = DQRCLearner(TorchEngine(q, Loss()), copy.deepcopy(q), DQRCSettings())
+    learner = DQRCLearner(TorchEngine(q, Loss()), copy.deepcopy(q), ReplaySettings(target_rule="dqrc"))
     s = torch.tensor([[0.5, 1.0, 1, 0, 1]], dtype=F64)
     one = torch.ones(1, dtype=F64)
     with pytest.raises(ValueError, match="action 1 is illegal"):

@@ -50,7 +50,7 @@ def test_weights_are_normalised_powers_of_beta() -> None:
     average = IterateAverage(theta, window=4.0)  # β = ¾
     for x in (1.0, 2.0, 5.0):
         theta[:] = torch.tensor([x, -x])
-        average.follow()
+        average.update()
     # (9/16·1 + 3/4·2 + 5) / (9/16 + 3/4 + 1) = (113/16)/(37/16)
     assert average.values.tolist() == pytest.approx([113 / 37, -113 / 37], rel=1e-14)
     assert theta.tolist() == [5.0, -5.0]
@@ -59,10 +59,10 @@ def test_weights_are_normalised_powers_of_beta() -> None:
 def test_a_window_of_one_step_is_the_last_iterate_and_a_wide_one_the_plain_mean() -> None:
     last, mean = (IterateAverage(theta := torch.zeros(1, dtype=torch.float64), window) for window in (1.0, 1e9))
     for average, expected in ((last, 5.0), (mean, 3.0)):
-        theta = average._followed
+        theta = average._iterate
         for x in (1.0, 3.0, 5.0):
             theta.fill_(x)
-            average.follow()
+            average.update()
         assert average.values.item() == pytest.approx(expected, rel=1e-6)
 
 

@@ -18,7 +18,7 @@ import pytest
 
 import neuralq.learners
 from neuralq.learners import LearnerKind, learner_kinds
-from neuralq.rules import target_rules
+from neuralq.rules import TargetRule, target_rules
 from neuralq.rules.records import discovered
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LEARNERS
@@ -239,12 +239,15 @@ def test_a_target_rule_in_a_file_of_its_own_is_learned_with_every_distribution(t
     assert json.loads((tmp_path / "run" / "config.json").read_text())["replay"]["halfway_share"] == 0.25
 
 
-def test_a_rule_says_what_it_follows_or_refuses_distributions() -> None:
-    rule = target_rules()["watkins"]
-    with pytest.raises(ValueError, match="'watkins' must refuse distributions, or say what it follows"):
-        dataclasses.replace(rule, refuses={})
-    with pytest.raises(ValueError, match="'watkins' says neither what it follows nor what its mean is"):
+def test_a_rule_that_follows_nothing_refuses_distributions_and_one_that_says_nothing_is_none() -> None:
+    rule = TargetRule("dream", "", "", mean=lambda seen: seen.r_t)
+    assert rule.refuses["distribution"].startswith("target_rule='dream' mixes means and")
+    with pytest.raises(ValueError, match="'dream' says neither what it follows nor what its mean is"):
         dataclasses.replace(rule, mean=None)
+    dqrc = target_rules()["dqrc"]
+    assert dqrc.refuses["distribution"].startswith("dqrc corrects the gradient of a squared error")
+    with pytest.raises(ValueError, match="corrects the gradient instead of freezing its targets; its learner knows"):
+        dqrc.target(None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("room", ["learners", "runs", "lab"])

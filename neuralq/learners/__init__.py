@@ -22,7 +22,7 @@ from neuralq.learners.gradient.step import GradientTDSettings
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits, learner_kinds
 from neuralq.learners.learner import Descent, HasEngineName, HasValues, Learner, Update
 from neuralq.learners.replay.distributional import DistributionalLearner
-from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead
+from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
@@ -31,7 +31,6 @@ from neuralq.learners.traces.streaming import StreamingLearner, StreamingSetting
 
 __all__ = [
     "DQRCLearner",
-    "DQRCSettings",
     "Descent",
     "DistributionalLearner",
     "GradientPredictionLearner",

@@ -29,7 +29,7 @@ class IterateAverage:
     Adam's moments (Kingma & Ba, 2015, §3).
 
     Args:
-        values: the vector to follow; it is read, never written.
+        values: the vector to average; it is read, never written.
         window: steps over which a weight falls by about e, at least 1; at 1 the average is the last iterate.
 
     Raises:
@@ -40,7 +40,7 @@ class IterateAverage:
         >>> average = IterateAverage(theta, window=2.0)
         >>> for x in (1.0, 4.0):
         ...     _ = theta.fill_(x)
-        ...     average.follow()
+        ...     average.update()
         >>> average.values.item()  # (½·1 + 1·4)/(½ + 1)
         3.0
     """
@@ -51,13 +51,13 @@ class IterateAverage:
         self.values = values.detach().clone()
         self.window = window
         self.num_steps = 0
-        self._followed = values
+        self._iterate = values
 
-    def follow(self) -> None:
+    def update(self) -> None:
         """Take in the vector as it is now."""
         self.num_steps += 1
         beta = 1.0 - 1.0 / self.window
-        self.values.lerp_(self._followed, (1.0 - beta) / (1.0 - beta**self.num_steps))
+        self.values.lerp_(self._iterate, (1.0 - beta) / (1.0 - beta**self.num_steps))
 
     def state_dict(self) -> dict[str, Any]:
         """The average and how many iterates it has seen."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -86,6 +86,9 @@ class HasEngineName(Protocol):
         ...
 
 
+_Numbers = TypeVar("_Numbers", Tensor, Array)
+
+
 class Descent:
     """Clipped steps of an optimiser along the engine's gradient, with the learning rate annealed linearly if asked.
 
@@ -109,20 +112,17 @@ class Descent:
         self._state = FlatOptimiser(optimiser, engine.flat.values)
         self.on_arrays = on_arrays(engine)
 
-    def step(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None, scale: float = 1.0) -> Tensor:
-        """One step on the weighted loss; returns the errors before it, ``[B]``."""
-        errors = self.engine.loss_gradient(s, a, target, weight)
-        self.follow(scale)
+    def fit(self, s: _Numbers, a: _Numbers, target: _Numbers, weight: _Numbers | None, scale: float = 1.0) -> _Numbers:
+        """One step on the weighted loss; returns the errors before it, ``[B]``; arrays where there is `on_arrays`."""
+        if isinstance(target, Tensor):
+            errors = self.engine.loss_gradient(s, a, target, weight)
+        else:
+            assert self.on_arrays is not None
+            errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)
+        self.step(scale)
         return errors
 
-    def step_arrays(self, s: Array, a: Array, target: Array, weight: Array | None, scale: float = 1.0) -> Array:
-        """As `step`, with arrays ``[B]``, where `on_arrays` is not None."""
-        assert self.on_arrays is not None
-        errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)
-        self.follow(scale)
-        return errors
-
-    def follow(self, scale: float = 1.0) -> None:
+    def step(self, scale: float = 1.0) -> None:
         """One step along the gradient that lies in the engine's flat vector, wherever it came from."""
         flat = self.engine.flat
         grad = flat.grad if flat.grad_array is None else flat.grad_array

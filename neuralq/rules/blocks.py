@@ -62,13 +62,6 @@ def _harutyunyan(seen: Seen) -> Tensor:
     return _corrected(seen, torch.full_like(seen.q_tm1[..., 0], seen.lambda_))
 
 
-def _means_only(rule: str) -> dict[str, str]:
-    return {
-        "distribution": f"target_rule={rule!r} mixes means and distribution={{distribution!r}} needs whole "
-        "distributions; use q_learning or double, with num_steps above 1 for longer returns"
-    }
-
-
 def _epsilon(refused_at_0: str = "") -> dict[str, Option]:
     """ε of the target policy; with 0 some rules are another."""
 
@@ -89,7 +82,6 @@ PENG = TargetRule(
     source="Peng & Williams 1996",
     mean=lambda seen: _returns(seen, seen.lambda_),
     blocks=True,
-    refuses=_means_only("peng"),
     place=10,
 )
 WATKINS = TargetRule(
@@ -98,7 +90,6 @@ WATKINS = TargetRule(
     source="Watkins 1989",
     mean=_watkins,
     blocks=True,
-    refuses=_means_only("watkins"),
     place=11,
 )
 RETRACE = TargetRule(
@@ -108,7 +99,6 @@ RETRACE = TargetRule(
     mean=_retrace,
     options=_epsilon("retrace"),
     blocks=True,
-    refuses=_means_only("retrace"),
     place=12,
 )
 TREE_BACKUP = TargetRule(
@@ -118,7 +108,6 @@ TREE_BACKUP = TargetRule(
     mean=_tree_backup,
     options=_epsilon("tree_backup"),
     blocks=True,
-    refuses=_means_only("tree_backup"),
     place=13,
 )
 HARUTYUNYAN = TargetRule(
@@ -128,6 +117,5 @@ HARUTYUNYAN = TargetRule(
     mean=_harutyunyan,
     options=_epsilon(),
     blocks=True,
-    refuses=_means_only("harutyunyan"),
     place=14,
 )

@@ -70,7 +70,6 @@ DQRC = TargetRule(
     name="dqrc",
     title="Q-learning with a corrected gradient, without a frozen copy",
     source="Patterson, White & White 2022",
-    mean=lambda seen: q_learning(seen.r_t, seen.discount_t, seen.online_t),
     options={
         "dqrc_beta": Option(1.0, _not_negative, "how strongly the second function is pulled to 0", _SECOND),
         "dqrc_learning_rate": Option("learning_rate", check_positive, "of the second function", _SECOND),

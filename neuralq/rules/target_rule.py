@@ -129,6 +129,7 @@ class TargetRule:
         correction: empty for targets from a frozen copy of the values; else what is done in place of freezing.
         refuses: why not, and the way out, by what it does not go with: "distribution" (any of them), "bounded" (those
             on a grid) and "num_steps" (above 1). ``{distribution!r}`` and ``{num_steps}`` stand for what was given.
+            A rule that follows nothing refuses distributions by itself.
         place: where it stands in lists; those of one number by name.
 
     Example:
@@ -149,17 +150,22 @@ class TargetRule:
     place: int = 100
 
     def __post_init__(self) -> None:
-        """A rule says at least one of the two."""
-        if self.follows is None and self.mean is None:
+        """A rule says what it follows, or what its means are and, by that, that it refuses whole distributions."""
+        if self.follows is None and self.mean is None and not self.correction:
             raise ValueError(f"the target rule {self.name!r} says neither what it follows nor what its mean is")
-        if self.follows is None and "distribution" not in self.refuses:
-            raise ValueError(f"the target rule {self.name!r} must refuse distributions, or say what it follows")
+        if self.follows is None:
+            why = (
+                f"target_rule={self.name!r} mixes means and distribution={{distribution!r}} needs whole distributions; "
+                "use q_learning or double, with num_steps above 1 for longer returns"
+            )
+            object.__setattr__(self, "refuses", {"distribution": why, **self.refuses})
 
     def target(self, seen: Seen) -> Tensor:
         """Targets for single values, with the shape of the rewards."""
         if self.mean is not None:
             return self.mean(seen)
-        assert self.follows is not None
+        if self.follows is None:
+            raise ValueError(f"target_rule={self.name!r} {self.correction}; its learner knows how")
         followed = self.follows(seen)
         if followed.a is not None:
             v_t = seen.q_t.gather(-1, followed.a[..., None])[..., 0]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
-from neuralq.learners.replay.distributions.record import Description, Moved, distributions
+from neuralq.learners.replay.distributions.record import Distribution, Moved, distributions
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.distributional import atoms, distribution_of
 from neuralq.q.engine import Engine, TorchEngine
@@ -63,7 +63,7 @@ class DistributionalLearner:
         reward_scale: float = 1.0,
         rng: np.random.Generator | None = None,
     ) -> None:
-        self._described = _description_for(engine.q, settings)
+        self._record = _record_for(engine.q, settings)
         self.engine: Engine = engine
         self._networks = engine
         self.settings = settings
@@ -81,18 +81,17 @@ class DistributionalLearner:
 
     @torch.no_grad()
     def _moved(self, transition: Transition) -> Moved:
-        target, described = self._networks.network(target=True), self._described
+        target, move, follows = self._networks.network(target=True), self._record.move, self.settings.rule.follows
+        assert move is not None and follows is not None
         seen = Seen(transition, self.engine.all, self.reward_scale, self.settings.lambda_, self._options)
         outputs_t = atoms(target, transition.s_t, self._levels(len(transition.a_tm1)))
-        assert self.settings.rule.follows is not None
-        followed = self.settings.rule.follows(seen)
-        return described.move(distribution_of(target), seen.r_t, seen.discount_t, outputs_t, followed)
+        return move(distribution_of(target), seen.r_t, seen.discount_t, outputs_t, follows(seen))
 
     def _levels(self, num_rows: int) -> Tensor | None:
         """Levels ``[B, K]`` drawn for one side of an update, where they are drawn."""
-        if self._described.levels is None or self.settings.num_atoms is None:
+        if self._record.levels is None or self.settings.num_atoms is None:
             return None
-        drawn = self._described.levels(num_rows, self.settings.num_atoms, self.rng)
+        drawn = self._record.levels(num_rows, self.settings.num_atoms, self.rng)
         return drawn.to(self.engine.flat.values.device, non_blocking=True)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
@@ -105,13 +104,14 @@ class DistributionalLearner:
         self.engine.flat.grad.zero_()
         outputs = atoms(self.engine.q, s, levels)
         outputs = outputs.gather(1, a[:, None, None].expand(-1, 1, outputs.shape[-1]))[:, 0]
-        each, aim = self._described.loss(outputs, moved, levels), moved.mean()
+        assert self._record.loss is not None
+        each, aim = self._record.loss(outputs, moved, levels), moved.mean()
         if weight is not None:
             check_same_shape("weight", weight, "r_t", transition.r_t)
             each = each * weight.to(each)
         each.mean().backward()  # type: ignore[no-untyped-call]
         errors = aim - distribution_of(self.engine.q).mean(outputs.detach())
-        self._descent.follow()
+        self._descent.step()
         self.num_updates += 1
         if self.num_updates % (self.settings.target_period_updates or 1) == 0:
             self.engine.sync_target()
@@ -130,14 +130,14 @@ class DistributionalLearner:
         self._descent.load_state_dict(state["descent"])
 
 
-def _description_for(q: QFunction, settings: ReplaySettings) -> Description:
-    """The description that the settings name, if it is that of ``q``."""
-    learned, inner = settings.returns.description, distribution_of(q)
+def _record_for(q: QFunction, settings: ReplaySettings) -> Distribution:
+    """The distribution that the settings name, if ``q`` describes it."""
+    named, inner = settings.returns, distribution_of(q)
     num_atoms = getattr(inner, "num_atoms", settings.num_atoms)  # where levels are drawn any number will do
-    if learned is None or not isinstance(inner, learned.q_class) or settings.num_atoms != num_atoms:
-        known = [x.name for x in distributions().values() if x.description and isinstance(inner, x.description.q_class)]
+    if named.q_class is None or not isinstance(inner, named.q_class) or settings.num_atoms != num_atoms:
+        known = [x.name for x in distributions().values() if x.q_class is not None and isinstance(inner, x.q_class)]
         raise ValueError(
             f"settings with distribution={settings.distribution!r} and num_atoms={settings.num_atoms} do not go "
             f"with a {', '.join(known)} representation of {num_atoms} atoms; make them alike"
         )
-    return learned
+    return named

@@ -15,18 +15,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from neuralq import rules
-from neuralq.checks import check_positive
 from neuralq.learners.gradient.correction import HeadCorrection
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.traces.memory import copy_into
 from neuralq.q.bodies import Trunk
 from neuralq.q.compiled import MlpEngine
@@ -35,7 +34,7 @@ from neuralq.q.masked import MaskedQ
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import QFunction, Transition
 
-__all__ = ["DQRCLearner", "DQRCSettings", "TwinHead", "has_hidden_units"]
+__all__ = ["DQRCLearner", "TwinHead", "has_hidden_units"]
 
 
 def _trunk_of(q: QFunction) -> Trunk | None:
@@ -108,57 +107,24 @@ class TwinHead(nn.Module):
         return self._in_place_of_the_last_layer(lambda: self._shared[0].at(s, a))
 
 
-@dataclass(frozen=True)
-class DQRCSettings:
-    """How a `DQRCLearner` learns.
-
-    Args:
-        learning_rate: of the values.
-        learning_rate_h: of the second function.
-        beta: β ≥ 0, how strongly h is pulled to 0.
-        optimiser: "adam", "radam" or "sgd", for both.
-        max_grad_norm: bound on the norm of each gradient; None for none.
-
-    Raises:
-        ValueError: for values outside their range.
-
-    Example:
-        >>> DQRCSettings(learning_rate=1e-4).beta
-        1.0
-    """
-
-    learning_rate: float = 1e-3
-    learning_rate_h: float = 1e-3
-    beta: float = 1.0
-    optimiser: str = "adam"
-    max_grad_norm: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values outside their range."""
-        for name in ("learning_rate", "learning_rate_h"):
-            check_positive(name, getattr(self, name))
-        if self.beta != 0:
-            check_positive("beta", self.beta)
-        if self.max_grad_norm is not None:
-            check_positive("max_grad_norm", self.max_grad_norm)
-        Optimiser(self.optimiser)
-
-
 class DQRCLearner:
     """Gradient-corrected Q-learning on samples ``[B]``.
 
     Args:
         engine: action values of any representation.
         head: the second function, with as many actions: a `TwinHead`, or any other Q-function.
-        settings: how to learn.
+        settings: how to learn; ``target_rule`` must be "dqrc".
         reward_scale: rewards are multiplied by it, so values are too.
+
+    Raises:
+        ValueError: for another target rule.
 
     Source: Patterson, White, White 2022 (DQRC); Ghiassian et al. 2020 (QRC).
 
     Example:
         >>> from neuralq.q import TableQ
         >>> from neuralq.q.engine import Loss, TorchEngine
-        >>> settings = DQRCSettings(learning_rate=0.5, learning_rate_h=0.5, optimiser="sgd")
+        >>> settings = ReplaySettings(target_rule="dqrc", learning_rate=0.5, optimiser="sgd")
         >>> learner = DQRCLearner(TorchEngine(TableQ(2, 1), Loss()), TableQ(2, 1), settings)
         >>> row = torch.tensor
         >>> step = Transition(row([0]), row([0]), row([1.0]), row([4.0]), row([0.5]), row([1]), row([False]))
@@ -168,7 +134,11 @@ class DQRCLearner:
         [3.0, -0.5]
     """
 
-    def __init__(self, engine: Engine, head: QFunction, settings: DQRCSettings, reward_scale: float = 1.0) -> None:
+    def __init__(self, engine: Engine, head: QFunction, settings: ReplaySettings, reward_scale: float = 1.0) -> None:
+        if not settings.rule.correction:
+            raise ValueError(
+                f"a DQRCLearner learns by target_rule='dqrc', got {settings.target_rule!r}; use ReplayLearner"
+            )
         self.engine = engine
         self.head = head
         self.settings = settings
@@ -177,6 +147,7 @@ class DQRCLearner:
         self._correction = HeadCorrection(head)
         self._parameters = module_parameters(engine.q)
         self._parameters_h = module_parameters(head)
+        self._beta, self._rate_h = settings.options["dqrc_beta"], settings.options["dqrc_learning_rate"]
         self._state = FlatOptimiser(Optimiser(settings.optimiser), engine.flat.values)
         self._state_h = FlatOptimiser(Optimiser(settings.optimiser), self._correction.values)
 
@@ -203,12 +174,12 @@ class DQRCLearner:
             weight = weight.to(delta.device)
             corrected, regression = corrected * weight, regression * weight
         grad = gradient(corrected.mean(), self._parameters)
-        grad_h = gradient(regression.mean(), self._parameters_h) + self.settings.beta * self._correction.values
+        grad_h = gradient(regression.mean(), self._parameters_h) + self._beta * self._correction.values
         if self.settings.max_grad_norm is not None:
             clip_norm_(grad, self.settings.max_grad_norm)
             clip_norm_(grad_h, self.settings.max_grad_norm)
         self._state.step(grad, self.settings.learning_rate)
-        self._state_h.step(grad_h, self.settings.learning_rate_h)
+        self._state_h.step(grad_h, self._rate_h)
         self.num_updates += 1
         return Update(delta, target)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits
 from neuralq.learners.replay.distributional import DistributionalLearner
-from neuralq.learners.replay.dqrc import DQRCLearner, DQRCSettings, TwinHead, has_hidden_units
+from neuralq.learners.replay.distributions.record import MEAN
+from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead, has_hidden_units
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.engine import Loss, TorchEngine
@@ -15,19 +16,13 @@ __all__ = ["REPLAY"]
 
 def _build(parts: Parts) -> ReplayLearner | DistributionalLearner | DQRCLearner:
     settings: ReplaySettings = parts.settings
-    if settings.returns.description is not None:
+    if settings.returns is not MEAN:
         assert isinstance(parts.engine, TorchEngine)
         return DistributionalLearner(parts.engine, settings, parts.reward_scale, parts.rng)
     if settings.rule.correction:
         head = TwinHead(parts.engine.q) if has_hidden_units(parts.engine.q) else parts.another()  # all 0, as it starts
-        return DQRCLearner(parts.engine, head, _dqrc_settings(settings), parts.reward_scale)
+        return DQRCLearner(parts.engine, head, settings, parts.reward_scale)
     return ReplayLearner(parts.engine, settings, parts.reward_scale)
-
-
-def _dqrc_settings(settings: ReplaySettings) -> DQRCSettings:
-    beta, rate_h = settings.dqrc_beta, settings.dqrc_learning_rate
-    assert beta is not None and rate_h is not None
-    return DQRCSettings(settings.learning_rate, rate_h, beta, settings.optimiser, settings.max_grad_norm)
 
 
 def _check(settings: ReplaySettings, representation: Representation) -> None:
@@ -37,7 +32,7 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
             "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
             "leave dueling out"
         )
-    if representation.engine == "compiled" and settings.returns.description is not None:
+    if representation.engine == "compiled" and settings.returns is not MEAN:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neuralq.learners.learner import Descent, Update
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
 from neuralq.q.engine import Engine
@@ -48,7 +49,7 @@ class ReplayLearner:
     """
 
     def __init__(self, engine: Engine, settings: ReplaySettings, reward_scale: float = 1.0) -> None:
-        if settings.returns.description is not None or settings.rule.correction:
+        if settings.returns is not MEAN or settings.rule.correction:
             raise ValueError(
                 f"a ReplayLearner learns means from frozen targets, got distribution={settings.distribution!r} and "
                 f"target_rule={settings.target_rule!r}; use DistributionalLearner or DQRCLearner"
@@ -85,7 +86,7 @@ class ReplayLearner:
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)
-        errors = self._descent.step(s, a, targets, weight)
+        errors = self._descent.fit(s, a, targets, weight)
         self._count()
         return Update(errors, targets)
 
@@ -109,7 +110,7 @@ class ReplayLearner:
         assert self._descent.on_arrays is not None
         q_t = self._descent.on_arrays.all_arrays(s_t, target=True)
         targets = q_learning_array_targets(r_t, discount_t, q_t, self.reward_scale)
-        errors = self._descent.step_arrays(s_tm1, a_tm1, targets, weight)
+        errors = self._descent.fit(s_tm1, a_tm1, targets, weight)
         self._count()
         return Update(torch.from_numpy(errors), torch.from_numpy(targets))
 

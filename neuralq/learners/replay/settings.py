@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.learners.optim import Optimiser
-from neuralq.learners.replay.distributions.record import Distribution, distributions
+from neuralq.learners.replay.distributions.record import MEAN, Distribution, distributions
 from neuralq.rules import Option, TargetRule, target_rules
 
 __all__ = ["ReplaySettings"]
@@ -114,6 +114,8 @@ class ReplaySettings:
             check_whole(name, getattr(self, name))
         check_fraction("lambda_", self.lambda_, "for Monte Carlo use lambda_=1")
         check_positive("learning_rate", self.learning_rate)
+        if self.max_grad_norm is not None:
+            check_positive("max_grad_norm", self.max_grad_norm)
         check_choice("target_rule", self.target_rule, target_rules())
         check_choice("distribution", self.distribution, distributions())
         Optimiser(self.optimiser)
@@ -213,7 +215,7 @@ def _check_combination(settings: ReplaySettings) -> None:
     """What the rule says it does not go with, in its words."""
     met = {
         "num_steps": settings.num_steps > 1,
-        "distribution": settings.returns.description is not None,
+        "distribution": settings.returns is not MEAN,
         "bounded": settings.returns.bounded,
     }
     for ground, why in settings.rule.refuses.items():

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from neuralq import rules
-from neuralq.learners.replay.distributions.record import Description, Distribution, Moved
+from neuralq.learners.replay.distributions.record import Distribution, Moved
 from neuralq.q import CategoricalQ
 from neuralq.types import QFunction
 
@@ -35,7 +35,9 @@ CATEGORICAL = Distribution(
     title="probabilities on a grid of values (C51)",
     source="Bellemare, Dabney & Munos 2017",
     losses=("cross_entropy",),
-    description=Description(CategoricalQ, _move, _loss),
+    q_class=CategoricalQ,
+    move=_move,
+    loss=_loss,
     num_atoms=51,
     least_atoms=2,
     bounded=True,

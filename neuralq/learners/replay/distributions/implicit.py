@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuralq.learners.kind import Representation
 from neuralq.learners.replay.distributions.quantile import move_values, quantile_loss
-from neuralq.learners.replay.distributions.record import Description, Distribution
+from neuralq.learners.replay.distributions.record import Distribution
 from neuralq.q.implicit import NUM_COSINES, ImplicitQuantileQ
 
 __all__ = ["IQN"]
@@ -38,7 +38,10 @@ IQN = Distribution(
     title="quantiles at drawn levels, by a function of the level (IQN)",
     source="Dabney, Ostrovski, Silver & Munos 2018",
     losses=("huber",),
-    description=Description(ImplicitQuantileQ, move_values, quantile_loss, _draw),
+    q_class=ImplicitQuantileQ,
+    move=move_values,
+    loss=quantile_loss,
+    levels=_draw,
     num_atoms=8,
     outputs=_outputs,
     represent=lambda q, settings, reward_scale, rng: ImplicitQuantileQ(q, rng),

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from neuralq import rules
-from neuralq.learners.replay.distributions.record import Description, Distribution, Moved
+from neuralq.learners.replay.distributions.record import Distribution, Moved
 from neuralq.q import QuantileQ
 
 __all__ = ["QUANTILE", "move_values", "quantile_loss"]
@@ -29,7 +29,9 @@ QUANTILE = Distribution(
     title="equally likely values (QR-DQN)",
     source="Dabney et al. 2018",
     losses=("huber",),
-    description=Description(QuantileQ, move_values, quantile_loss),
+    q_class=QuantileQ,
+    move=move_values,
+    loss=quantile_loss,
     num_atoms=32,
     represent=lambda q, settings, reward_scale, rng: QuantileQ(q, settings.num_atoms),
     place=2,

@@ -15,7 +15,7 @@ from neuralq.rules import Followed
 from neuralq.rules.records import discovered
 from neuralq.types import QFunction
 
-__all__ = ["Description", "Distribution", "Moved", "distributions"]
+__all__ = ["MEAN", "Distribution", "Moved", "distributions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,23 +37,6 @@ class Moved:
         return (self.probabilities * self.values).sum(-1)
 
 
-@dataclass(frozen=True, eq=False)
-class Description:
-    """How the distribution is learned that a Q-function is the mean of.
-
-    Args:
-        q_class: class of the Q-function.
-        move: ``move(q, r_t, discount_t, outputs_t, followed) -> Moved``: the successor's distribution, moved by a step.
-        loss: ``loss(outputs_tm1 [B, K], moved, levels)``: what is descended, ``[B]``.
-        levels: ``levels(num_rows, num_atoms, rng)``: levels drawn for an update, ``[B, K]``; None where they are fixed.
-    """
-
-    q_class: type[Any]
-    move: Callable[[Any, Tensor, Tensor, Tensor, Followed], Moved]
-    loss: Callable[[Tensor, Moved, Tensor | None], Tensor]
-    levels: Callable[[int, int, np.random.Generator], Tensor] | None = None
-
-
 def _one_network(settings: Any, representation: Representation) -> None:
     """Refuse layouts with one output per action."""
     if representation.layout in ("action-input", "separate"):
@@ -72,7 +55,12 @@ class Distribution:
         title: what it is, in a few words.
         source: author and year.
         losses: the losses it can have, its own first.
-        description: how it is learned; None where means are.
+        q_class: class of the Q-function whose values are the distribution's means; None where only means are learned,
+            and then the next three are not needed.
+        move: ``move(q, r_t, discount_t, outputs_t, followed) -> Moved``: the successor's distribution, from the numbers
+            of every action ``[B, A, K]``, moved by a step.
+        loss: ``loss(outputs_tm1 [B, K], moved, levels)``: what is descended, ``[B]``.
+        levels: ``levels(num_rows, num_atoms, rng)``: levels drawn for an update, ``[B, K]``; None where they are fixed.
         num_atoms: numbers for each action where none are asked for; None where there is no choice.
         least_atoms: the fewest.
         bounded: whether returns must lie in a range that is given.
@@ -86,7 +74,10 @@ class Distribution:
     title: str
     source: str
     losses: tuple[str, ...]
-    description: Description | None = None
+    q_class: type[Any] | None = None
+    move: Callable[[Any, Tensor, Tensor, Tensor, Followed], Moved] | None = None
+    loss: Callable[[Tensor, Moved, Tensor | None], Tensor] | None = None
+    levels: Callable[[int, int, np.random.Generator], Tensor] | None = None
     num_atoms: int | None = None
     least_atoms: int = 1
     bounded: bool = False
@@ -94,6 +85,16 @@ class Distribution:
     outputs: Callable[[Any, str], int] = lambda settings, layout: settings.num_atoms or 1
     check: Callable[[Any, Representation], None] = _one_network
     place: int = 100
+
+
+MEAN = Distribution(
+    name="none",
+    title="the mean of the return",
+    source="Mnih et al. 2015",
+    losses=("huber", "squared"),
+    check=lambda settings, representation: None,
+    place=1,
+)
 
 
 @functools.cache
