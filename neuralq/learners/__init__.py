@@ -14,13 +14,14 @@ Where those diverge, others converge: `ResidualGradientLearner` descends the Bel
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 """
 
+from neuralq.learners.descent import Descent
 from neuralq.learners.gradient.correction import HeadCorrection, TangentCorrection
 from neuralq.learners.gradient.learner import GradientPredictionLearner, GradientQLearner
 from neuralq.learners.gradient.residual import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.gradient.settings import GradientSettings
 from neuralq.learners.gradient.step import GradientTDSettings
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits, learner_kinds
-from neuralq.learners.learner import Descent, HasEngineName, HasValues, Learner, Update
+from neuralq.learners.learner import HasEngineName, HasValues, Learner, Update
 from neuralq.learners.replay.distributional import DistributionalLearner
 from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner

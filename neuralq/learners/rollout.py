@@ -16,9 +16,11 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
+from neuralq.learners import descent
 from neuralq.learners.averaging import IterateAverage
+from neuralq.learners.descent import Descent
 from neuralq.learners.kind import LearnerKind, Parts, Traits
-from neuralq.learners.learner import Descent, Update
+from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
 from neuralq.q.engine import Engine
 from neuralq.types import Array, Transition
@@ -171,10 +173,7 @@ class RolloutLearner:
             order = order if rows is None else rows[order]
             parts = [part for part in np.array_split(order, self.settings.num_minibatches) if len(part)]
             errors, picked = self._fit(transition, targets, parts, annealed) if parts else (errors, picked)
-        self.num_updates += 1
-        period = self.settings.target_period_updates
-        if period is not None and self.num_updates % period == 0:
-            self.engine.sync_target()
+        descent.count_update(self, self.settings.target_period_updates)
         return Update(errors, picked)
 
     def _fit(
@@ -200,18 +199,16 @@ class RolloutLearner:
         """The parameters for greedy play: the average where one is kept, else those that are learned."""
         return self.engine.flat.values if self._average is None else self._average.values
 
-    def begin_streams(self) -> None:
-        """Nothing connects one sample to the next."""
+    begin_streams = descent.begin_streams
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, optimiser, target copy, average and counters."""
         average = None if self._average is None else self._average.state_dict()
-        return {"num_updates": self.num_updates, "descent": self._descent.state_dict(), "average": average}
+        return {**descent.state_dict(self), "average": average}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self._descent.load_state_dict(state["descent"])
+        descent.load_state_dict(self, state)
         if self._average is not None:
             self._average.load_state_dict(state["average"])
 

@@ -11,14 +11,13 @@ What is reported as an error is the difference of the means; priorities are made
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq.learners.learner import Descent, Update
+from neuralq.learners import descent
+from neuralq.learners.descent import Descent
+from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import Distribution, Moved, distributions
 from neuralq.learners.replay.settings import ReplaySettings
@@ -112,22 +111,12 @@ class DistributionalLearner:
         each.mean().backward()  # type: ignore[no-untyped-call]
         errors = aim - distribution_of(self.engine.q).mean(outputs.detach())
         self._descent.step()
-        self.num_updates += 1
-        if self.num_updates % (self.settings.target_period_updates or 1) == 0:
-            self.engine.sync_target()
+        descent.count_update(self, self.settings.target_period_updates)
         return Update(errors, aim)
 
-    def begin_streams(self) -> None:
-        """Nothing connects one sample to the next."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, optimiser, target copy and counters."""
-        return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self._descent.load_state_dict(state["descent"])
+    begin_streams = descent.begin_streams
+    state_dict = descent.state_dict
+    load_state_dict = descent.load_state_dict
 
 
 def _record_for(q: QFunction, settings: ReplaySettings) -> Distribution:

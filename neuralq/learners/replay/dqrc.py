@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from neuralq import rules
+from neuralq.learners import descent
 from neuralq.learners.gradient.correction import HeadCorrection
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
@@ -183,8 +184,7 @@ class DQRCLearner:
         self.num_updates += 1
         return Update(delta, target)
 
-    def begin_streams(self) -> None:
-        """Nothing connects one sample to the next."""
+    begin_streams = descent.begin_streams
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, those of h, both optimisers and counters."""

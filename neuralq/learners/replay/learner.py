@@ -6,13 +6,12 @@ rule serves both. Blocks ``[T, B]`` get λ-returns from the target copy, as in D
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from neuralq.learners.learner import Descent, Update
+from neuralq.learners import descent
+from neuralq.learners.descent import Descent
+from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.settings import ReplaySettings
@@ -87,7 +86,7 @@ class ReplayLearner:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)
         errors = self._descent.fit(s, a, targets, weight)
-        self._count()
+        descent.count_update(self, self.settings.target_period_updates)
         return Update(errors, targets)
 
     def _arrays_of(self, transition: Transition) -> tuple[Array, ...] | None:
@@ -111,22 +110,9 @@ class ReplayLearner:
         q_t = self._descent.on_arrays.all_arrays(s_t, target=True)
         targets = q_learning_array_targets(r_t, discount_t, q_t, self.reward_scale)
         errors = self._descent.fit(s_tm1, a_tm1, targets, weight)
-        self._count()
+        descent.count_update(self, self.settings.target_period_updates)
         return Update(torch.from_numpy(errors), torch.from_numpy(targets))
 
-    def _count(self) -> None:
-        self.num_updates += 1
-        if self.num_updates % (self.settings.target_period_updates or 1) == 0:
-            self.engine.sync_target()
-
-    def begin_streams(self) -> None:
-        """Nothing connects one sample to the next."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, optimiser, target copy and counters."""
-        return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self._descent.load_state_dict(state["descent"])
+    begin_streams = descent.begin_streams
+    state_dict = descent.state_dict
+    load_state_dict = descent.load_state_dict
