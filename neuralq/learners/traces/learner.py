@@ -15,9 +15,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners import state
 from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
-from neuralq.learners.traces import memory
 from neuralq.learners.traces.memory import Traces
 from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
@@ -148,7 +148,7 @@ class OnlineLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, 1)
-        self._memory = {"traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "traces": self._core.traces}
 
     def increment(self, transition: Transition, weight: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -170,9 +170,9 @@ class OnlineLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 class PredictionLearner:
@@ -205,7 +205,7 @@ class PredictionLearner:
         self.settings = settings
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, engine.q.num_actions)
-        self._memory = {"traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "traces": self._core.traces}
 
     def increment(self, transition: Transition, rho_tm1: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -234,9 +234,9 @@ class PredictionLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 ONLINE = LearnerKind(
