@@ -12,6 +12,8 @@ a representation with one output, which bounds its step, or `PredictionLearner`,
 
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
+
+A learner that runs can be made of ends with its `LearnerKind`; `learner_kinds` finds it, and nothing else lists it.
 """
 
 from neuralq.learners.descent import Descent

@@ -1,8 +1,4 @@
-"""Steps of an optimiser towards targets that are held fixed, and the methods that learners around them share.
-
-A learner that descends keeps its `Descent` under ``_descent``, counts in ``num_updates``, and takes `state_dict`,
-`load_state_dict` and `begin_streams` as they stand here.
-"""
+"""Steps of an optimiser towards targets that are held fixed."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from neuralq.q.compiled import on_arrays
 from neuralq.q.engine import Engine
 from neuralq.types import Array
 
-__all__ = ["Descent", "begin_streams", "count_update", "load_state_dict", "state_dict"]
+__all__ = ["Descent", "count_update"]
 
 _Numbers = TypeVar("_Numbers", Tensor, Array)
 
@@ -88,18 +84,3 @@ def count_update(self: Any, target_period: int | None) -> None:
     self.num_updates += 1
     if target_period is not None and self.num_updates % target_period == 0:
         self.engine.sync_target()
-
-
-def begin_streams(self: Any) -> None:
-    """Nothing connects one sample to the next."""
-
-
-def state_dict(self: Any) -> dict[str, Any]:
-    """Parameters, optimiser, target copy and counter: everything that a continued run needs."""
-    return {"num_updates": self.num_updates, "descent": self._descent.state_dict()}
-
-
-def load_state_dict(self: Any, state: Mapping[str, Any]) -> None:
-    """Continue from `state_dict`, bit for bit."""
-    self.num_updates = int(state["num_updates"])
-    self._descent.load_state_dict(state["descent"])

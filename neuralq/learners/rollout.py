@@ -6,7 +6,6 @@ returns cut λ at exploring actions. Values are computed once per rollout, with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +15,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
-from neuralq.learners import descent
+from neuralq.learners import state
 from neuralq.learners.averaging import IterateAverage
-from neuralq.learners.descent import Descent
+from neuralq.learners.descent import Descent, count_update
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
@@ -140,6 +139,7 @@ class RolloutLearner:
         if settings.average_updates is not None:
             window = settings.average_updates * settings.num_epochs * settings.num_minibatches
             self._average = IterateAverage(engine.flat.values, window)
+        self._parts = {"descent": self._descent, "average": self._average}
         if settings.target_period_updates is not None:
             engine.sync_target()
 
@@ -173,7 +173,7 @@ class RolloutLearner:
             order = order if rows is None else rows[order]
             parts = [part for part in np.array_split(order, self.settings.num_minibatches) if len(part)]
             errors, picked = self._fit(transition, targets, parts, annealed) if parts else (errors, picked)
-        descent.count_update(self, self.settings.target_period_updates)
+        count_update(self, self.settings.target_period_updates)
         return Update(errors, picked)
 
     def _fit(
@@ -199,18 +199,9 @@ class RolloutLearner:
         """The parameters for greedy play: the average where one is kept, else those that are learned."""
         return self.engine.flat.values if self._average is None else self._average.values
 
-    begin_streams = descent.begin_streams
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, optimiser, target copy, average and counters."""
-        average = None if self._average is None else self._average.state_dict()
-        return {**descent.state_dict(self), "average": average}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        descent.load_state_dict(self, state)
-        if self._average is not None:
-            self._average.load_state_dict(state["average"])
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 def _build(parts: Parts) -> RolloutLearner:

@@ -8,7 +8,7 @@ K numbers of every action with `atoms`.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -132,7 +132,6 @@ class CategoricalQ(nn.Module):
         return self.all(s).gather(-1, a[..., None])[..., 0]
 
 
-@runtime_checkable
 class Distributional(Protocol):
     """A Q-function whose values are means of what it says of returns."""
 
@@ -159,7 +158,7 @@ def distribution_of(q: QFunction) -> Any:
         5
     """
     inner = q.inner if isinstance(q, MaskedQ) else q
-    if not isinstance(inner, Distributional):
+    if not hasattr(inner, "outputs"):  # asked at every update, and asking for a protocol is slow
         raise ValueError(f"{type(inner).__name__} has no distribution; wrap it in QuantileQ or CategoricalQ")
     return inner
 

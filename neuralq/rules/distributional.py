@@ -171,8 +171,11 @@ def followed_mass(r_t: Tensor, discount_t: Tensor, logits_t: Tensor, support: Te
     else:
         mass = (_or_first(_policy(followed))[..., None] * torch.softmax(logits_t, -1)).sum(-2)
     r_t = r_t if followed.bonus is None else r_t + followed.bonus
-    z = support if followed.entropy is None else support + followed.entropy[..., None]
-    return categorical_projection(r_t[..., None] + weighted_value(discount_t[..., None], z), mass, support)
+    if followed.entropy is None:
+        moved = discount_t[..., None] * support
+    else:
+        moved = weighted_value(discount_t[..., None], support + followed.entropy[..., None])
+    return categorical_projection(r_t[..., None] + moved, mass, support)
 
 
 def _of_action(numbers: Tensor, a: Tensor) -> Tensor:

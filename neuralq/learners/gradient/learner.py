@@ -25,11 +25,11 @@ import torch
 from torch import Tensor
 
 from neuralq import rules
+from neuralq.learners import state
 from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
 from neuralq.learners.learner import Update
-from neuralq.learners.traces import memory
 from neuralq.q.compiled import MlpEngine
 from neuralq.q.engine import Engine
 from neuralq.types import Transition
@@ -78,7 +78,7 @@ class GradientPredictionLearner:
         self.settings = settings
         self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
-        self._memory = {"h": correction.values, "traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "h": correction.values, "traces": self._core.traces}
 
     def increments(
         self, transition: Transition, rho_tm1: Tensor | None = None, weight: Tensor | None = None
@@ -117,9 +117,9 @@ class GradientPredictionLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 class GradientQLearner:
@@ -174,7 +174,7 @@ class GradientQLearner:
         self.policy = policy
         self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
-        self._memory = {"h": correction.values, "traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "h": correction.values, "traces": self._core.traces}
 
     @property
     def engine_name(self) -> str:
@@ -220,6 +220,6 @@ class GradientQLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict

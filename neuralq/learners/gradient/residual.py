@@ -19,9 +19,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners import state
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
-from neuralq.learners.traces import memory
 from neuralq.q.engine import Engine
 from neuralq.rules.shapes import check_same_shape
 from neuralq.types import Transition
@@ -126,7 +126,7 @@ class ResidualGradientLearner:
         self._parameters = module_parameters(engine.q)
         self._direct = torch.zeros_like(engine.flat.values)
         self._residual = torch.zeros_like(engine.flat.values)
-        self._memory = {"direct": self._direct, "residual": self._residual}
+        self._parts = {"parameters": engine.flat, "direct": self._direct, "residual": self._residual}
 
     def _bootstrap(self, transition: Transition) -> Tensor:
         """γ times the value of the successor, with its graph, ``[B]``."""
@@ -186,6 +186,6 @@ class ResidualGradientLearner:
         self._residual.lerp_(residual, self.settings.trace_rate)
         return adaptive_phi(self._direct, self._residual)
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq.learners import descent
-from neuralq.learners.descent import Descent
+from neuralq.learners import state
+from neuralq.learners.descent import Descent, count_update
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import Distribution, Moved, distributions
@@ -71,6 +71,7 @@ class DistributionalLearner:
         self.num_updates = 0
         self._options = settings.options
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._parts = {"descent": self._descent}
         engine.sync_target()
 
     def targets(self, transition: Transition) -> Tensor:
@@ -111,12 +112,12 @@ class DistributionalLearner:
         each.mean().backward()  # type: ignore[no-untyped-call]
         errors = aim - distribution_of(self.engine.q).mean(outputs.detach())
         self._descent.step()
-        descent.count_update(self, self.settings.target_period_updates)
+        count_update(self, self.settings.target_period_updates)
         return Update(errors, aim)
 
-    begin_streams = descent.begin_streams
-    state_dict = descent.state_dict
-    load_state_dict = descent.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 def _record_for(q: QFunction, settings: ReplaySettings) -> Distribution:

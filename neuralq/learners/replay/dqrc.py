@@ -14,20 +14,19 @@ second term only: −∇L = δ ∇Q − h γ ∇max Q', the direction of TDC. An
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
-from typing import Any, cast
+from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from neuralq import rules
-from neuralq.learners import descent
+from neuralq.learners import state
 from neuralq.learners.gradient.correction import HeadCorrection
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
 from neuralq.learners.replay.settings import ReplaySettings
-from neuralq.learners.traces.memory import copy_into
 from neuralq.q.bodies import Trunk
 from neuralq.q.compiled import MlpEngine
 from neuralq.q.engine import Engine
@@ -151,6 +150,8 @@ class DQRCLearner:
         self._beta, self._rate_h = settings.options["dqrc_beta"], settings.options["dqrc_learning_rate"]
         self._state = FlatOptimiser(Optimiser(settings.optimiser), engine.flat.values)
         self._state_h = FlatOptimiser(Optimiser(settings.optimiser), self._correction.values)
+        optimisers = {"optimiser": self._state, "optimiser_h": self._state_h}
+        self._parts = {"parameters": engine.flat, "h": self._correction.values, **optimisers}
 
     @property
     def engine_name(self) -> str:
@@ -184,22 +185,6 @@ class DQRCLearner:
         self.num_updates += 1
         return Update(delta, target)
 
-    begin_streams = descent.begin_streams
-
-    def state_dict(self) -> dict[str, Any]:
-        """Parameters, those of h, both optimisers and counters."""
-        return {
-            "num_updates": self.num_updates,
-            "parameters": self.engine.flat.values,
-            "h": self._correction.values,
-            "optimiser": self._state.state_dict(),
-            "optimiser_h": self._state_h.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`, bit for bit."""
-        self.num_updates = int(state["num_updates"])
-        self.engine.flat.load(torch.as_tensor(state["parameters"]))
-        copy_into({"h": self._correction.values}, state)
-        self._state.load_state_dict(state["optimiser"])
-        self._state_h.load_state_dict(state["optimiser_h"])
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict

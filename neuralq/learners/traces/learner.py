@@ -15,9 +15,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners import state
 from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
-from neuralq.learners.traces import memory
 from neuralq.learners.traces.memory import Traces
 from neuralq.q.engine import Engine
 from neuralq.q.masked import MaskedQ
@@ -68,10 +68,13 @@ class _Core:
         values = engine.flat.values
         shapes = {"z": (num_outputs, values.numel()), "v_old": (num_outputs,)}  # v_old: V before the last update
         self.traces = Traces(settings.lambda_, num_envs, values, shapes)
+        # The same memory, one row for each environment's output.
+        self._z, self._v_old = self.traces.z["z"].view(-1, values.numel()), self.traces.z["v_old"].view(-1)
 
     def increment(
         self,
         transition: Transition,
+        discount_t: Tensor,
         outputs: Tensor,
         targets: Tensor,
         v_t: Tensor,
@@ -79,31 +82,32 @@ class _Core:
         rho_tm1: Tensor | None = None,
         weight: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """What to add to the weights ``[d]``, and the errors of ``outputs``, all ``[N, k]``; the traces move on."""
-        z, v_old = self.traces.z["z"], self.traces.z["v_old"]
+        """What to add to the weights ``[d]``, and the errors of ``outputs``, all ``[N·k]``; the traces move on."""
         total, errors = torch.zeros_like(self.engine.flat.values), torch.zeros_like(targets)
-        for i in range(len(targets)):
+        k = len(targets) // len(discount_t)
+        for j in range(len(targets)):
+            i = j // k
             if weight is not None and weight[i] == 0:
                 continue
+            z = self._z[j]
             if explored is not None:
-                z[i].masked_fill_(explored[i], 0.0)
-            for k in range(targets.shape[1]):
-                v_tm1 = self.engine.value_gradient(transition.s_tm1[i], outputs[i, k])
-                grad = self.engine.flat.grad
-                trace = self._grown(z[i, k], grad, self.traces.decay[i])
-                if rho_tm1 is not None:
-                    # The ratio multiplies the whole trace, once: z = ρ(γλz + ∇V); the increment uses δ unweighted.
-                    trace = rho_tm1[i] * trace
-                z[i, k] = trace
-                delta = targets[i, k] - v_tm1
-                errors[i, k] = delta
-                if self.settings.trace == "dutch":
-                    alpha = self.settings.step_size
-                    total += rules.true_online_increment(trace, grad, delta, v_tm1, v_old[i, k], alpha)
-                else:
-                    total += self.settings.step_size * delta * trace
-            v_old[i] = v_t[i]
-        self.traces.close(transition.discount_t, transition.last_t, None if weight is None else weight != 0)
+                z.masked_fill_(explored[i], 0.0)
+            v_tm1 = self.engine.value_gradient(transition.s_tm1[i], outputs[j])
+            grad = self.engine.flat.grad
+            trace = self._grown(z, grad, self.traces.decay[i])
+            if rho_tm1 is not None:
+                # The ratio multiplies the whole trace, once: z = ρ(γλz + ∇V); the increment uses δ unweighted.
+                trace = rho_tm1[i] * trace
+            z.copy_(trace)
+            delta = targets[j] - v_tm1
+            errors[j] = delta
+            if self.settings.trace == "dutch":
+                alpha = self.settings.step_size
+                total += rules.true_online_increment(trace, grad, delta, v_tm1, self._v_old[j], alpha)
+            else:
+                total += self.settings.step_size * delta * trace
+            self._v_old[j] = v_t[j]
+        self.traces.close(discount_t, transition.last_t, None if weight is None else weight != 0)
         return total, errors
 
     def _grown(self, z: Tensor, grad: Tensor, decay: Tensor) -> Tensor:
@@ -147,20 +151,20 @@ class OnlineLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, 1)
-        self._memory = {"traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "traces": self._core.traces}
 
     def increment(self, transition: Transition, weight: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
         dtype = self.engine.flat.values.dtype
         q_t = self.engine.all(transition.s_t)
-        r_t = transition.r_t.to(dtype) * self.reward_scale
-        targets = rules.q_learning(r_t, transition.discount_t.to(dtype), q_t)
+        r_t, discount_t = transition.r_t.to(dtype) * self.reward_scale, transition.discount_t.to(dtype)
+        targets = rules.q_learning(r_t, discount_t, q_t)
         explored = None
         if self.settings.cut == "watkins":
             explored = ~rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
-        columns = transition.a_tm1[:, None], targets[:, None], q_t.amax(-1, keepdim=True)
-        total, errors = self._core.increment(transition, *columns, explored, weight=weight)
-        return total, Update(errors[:, 0], targets)
+        rows = transition.a_tm1, targets, q_t.amax(-1)
+        total, errors = self._core.increment(transition, discount_t, *rows, explored, weight=weight)
+        return total, Update(errors, targets)
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from one step of every environment, ``[N]``; environments of weight 0 did not move."""
@@ -169,9 +173,9 @@ class OnlineLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 class PredictionLearner:
@@ -204,7 +208,7 @@ class PredictionLearner:
         self.settings = settings
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, engine.q.num_actions)
-        self._memory = {"traces": self._core.traces}
+        self._parts = {"parameters": engine.flat, "traces": self._core.traces}
 
     def increment(self, transition: Transition, rho_tm1: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -213,8 +217,9 @@ class PredictionLearner:
         discount_t = transition.discount_t.to(v_t.dtype)
         targets = rules.one_step(r_t, discount_t[:, None].expand_as(v_t), v_t)
         outputs = torch.arange(v_t.shape[1], device=v_t.device).expand_as(v_t)
-        total, errors = self._core.increment(transition, outputs, targets, v_t, rho_tm1=rho_tm1)
-        return total, Update(errors, targets)
+        rows = outputs.reshape(-1), targets.reshape(-1), v_t.reshape(-1)
+        total, errors = self._core.increment(transition, discount_t, *rows, rho_tm1=rho_tm1)
+        return total, Update(errors.view_as(targets), targets)
 
     def update(self, transition: Transition, rho_tm1: Tensor | None = None) -> Update:
         """Learn from one step of every environment.
@@ -233,9 +238,9 @@ class PredictionLearner:
         self.num_updates += 1
         return seen
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 ONLINE = LearnerKind(

@@ -26,9 +26,9 @@ from torch import Tensor
 
 from neuralq import rules
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive
+from neuralq.learners import state
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
-from neuralq.learners.traces import memory
 from neuralq.learners.traces import streaming_kernels as kernels
 from neuralq.q.engine import Engine
 from neuralq.q.single_row import SingleRowNetwork, runs_single_row
@@ -200,7 +200,7 @@ class StreamingLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._steps = _Steps(engine, settings, discount)
-        self._memory = {"steps": self._steps}
+        self._parts = {"parameters": engine.flat, "steps": self._steps}
         self._compiled = kind != "torch" and on_cpu
         self._network = SingleRowNetwork(engine) if self._compiled and runs_single_row(engine.q) else None
 
@@ -273,9 +273,9 @@ class StreamingLearner:
         seen_both = torch.from_numpy(np.array([delta, target]))
         return Update(seen_both[:1], seen_both[1:])
 
-    begin_streams = memory.begin_streams
-    state_dict = memory.state_dict
-    load_state_dict = memory.load_state_dict
+    begin_streams = state.begin_streams
+    state_dict = state.state_dict
+    load_state_dict = state.load_state_dict
 
 
 def _build(parts: Parts) -> StreamingLearner:
