@@ -84,7 +84,7 @@ def certified(problem: PlanningProblem, v: Floats) -> PlanningProblem:
         return problem
     gap = v[problem.mdp.s_tm1] - q_of_rows(problem, v)
     error = 2 * (float(np.max(-gap, initial=0.0)) + problem.rounding(v))
-    near = gap <= max(1e-7 * (1 + float(np.abs(v).max())), error)
+    near = gap <= max(1e-7 * (problem.largest_reward + float(np.abs(v).max())), error)
     covered = np.zeros(problem.mdp.num_states, dtype=bool)
     covered[problem.mdp.s_tm1[near]] = True
     if not covered[problem.acts].all():
