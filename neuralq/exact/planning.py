@@ -12,7 +12,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,12 @@ from neuralq.exact.sweeping import gauss_seidel, modified_policy_iteration, valu
 from neuralq.exact.undiscounted import (
     bellman_ford,
     certified,
+    ending_at_rest,
     episodic,
     is_shortest_path,
     path_rounding,
     proper_policy_iteration,
+    resting_rows,
 )
 from neuralq.mdp import FiniteMDP
 
@@ -105,6 +107,7 @@ def solve(
         mdp: the model.
         gamma: γ in [0, 1]. With 1 episodes must end: ``"auto"`` and ``"policy-iteration"`` need a policy that ends them
             from every state, and one that never does must earn less; other methods need that every policy ends them.
+            Where no end can be reached, but one can rest at reward 0 and earn nothing, V* is 0 (an absorbing goal).
         method: ``"value-iteration"``, ``"gauss-seidel"``, ``"policy-iteration"``, ``"modified-policy-iteration"``,
             ``"prioritized-sweeping"``, ``"linear-programming"``, ``"rtdp"``, ``"labelled-rtdp"``, ``"bellman-ford"``
             (deterministic with γ = 1 only), or ``"auto"``: Bellman–Ford where it applies, policy iteration for small
@@ -136,6 +139,11 @@ def solve(
     began = time.perf_counter()
     problem = prepare(mdp, gamma)
     tol = tol or default_tolerance(problem)
+    resting = resting_rows(problem) if math.isinf(problem.reach) else np.empty(0, dtype=np.int64)
+    if resting.size:
+        ends = ending_at_rest(mdp, resting)
+        answer = solve(ends, gamma, method, tol, max_iterations=max_iterations, seed=seed)
+        return _with_rest(problem, resting, answer, began)
     chosen = _automatic(problem) if method == "auto" else method
     limit = math.inf if max_iterations is None else max_iterations
     if math.isinf(problem.reach) and chosen != "bellman-ford":
@@ -147,6 +155,22 @@ def solve(
     else:
         found = _SOLVERS[chosen](problem, tol, limit)
     return _proven(problem, found, tol, chosen, began)
+
+
+def _with_rest(problem: PlanningProblem, resting: NDArray[np.int64], answer: Solution, began: float) -> Solution:
+    """An answer for the model that ends at rest, told of the actions that there are at rest."""
+    mdp = problem.mdp
+    at_rest = np.zeros(mdp.num_states, dtype=bool)
+    at_rest[mdp.s_tm1[resting]] = True
+    values = q_of_rows(problem, answer.v)
+    rows = np.flatnonzero(at_rest[mdp.s_tm1])
+    s, a = mdp.s_tm1[rows], mdp.a_tm1[rows]
+    q, optimal, policy = answer.q.copy(), answer.optimal_actions.copy(), answer.policy.copy()
+    q[s, a] = values[rows]
+    optimal[s, a] = values[rows] >= -2 * (answer.bound + answer.residual)
+    policy[mdp.s_tm1[resting[::-1]]] = mdp.a_tm1[resting[::-1]]  # the last written is the lowest
+    seconds = time.perf_counter() - began
+    return replace(answer, q=q, optimal_actions=optimal, policy=policy, seconds=seconds)
 
 
 def _automatic(problem: PlanningProblem) -> str:

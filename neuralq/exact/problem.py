@@ -135,14 +135,18 @@ def prepare(mdp: FiniteMDP, gamma: float) -> PlanningProblem:
     return PlanningProblem(mdp, gamma, rows, acts, reach, least, longest, size)
 
 
-def trapped_rows(problem: PlanningProblem) -> NDArray[np.int64]:
+def trapped_rows(problem: PlanningProblem, among: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
     """Rows by which some policy stays for ever without discount: those of the largest set that need not be left.
+
+    With ``among`` (a mask of rows) only these are taken.
 
     Each of them loses nothing and leads only to states that have such a row (the maximal end components, de Alfaro
     1997). Empty iff every policy ends its episodes.
     """
     mdp = problem.mdp
     loses_nothing = problem.rows.decay * mdp.row_mass >= 1 - 1e-9
+    if among is not None:
+        loses_nothing &= among
     pattern = sparse.csr_array(
         ((mdp.transition.data > 0).astype(np.float64), mdp.transition.indices, mdp.transition.indptr),
         shape=mdp.transition.shape,
