@@ -78,6 +78,8 @@ class RolloutSettings:
             check_whole(name, getattr(self, name))
         check_positive("learning_rate", self.learning_rate)
         Optimiser(self.optimiser)
+        if self.max_grad_norm is not None:
+            check_positive("max_grad_norm", self.max_grad_norm)
         if self.target_period_updates is not None:
             check_whole("target_period_updates", self.target_period_updates)
         check_fraction("anneal_to", self.anneal_to)

@@ -43,6 +43,7 @@ ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.function
 
 
 _INITS = ("uniform", "he")
+_SQUARABLE = 1e-15  # entries up to its inverse are squared and summed in float32 without a thought
 _HE, _LAST = 2.0, 1.0  # times 1/fan_in: rectified units halve the variance, and above the last layer there are none
 
 
@@ -106,19 +107,26 @@ class GroupedLayerNorm(nn.Module):
         shape: normalised shape of one copy.
         dtype: of scale and shift.
         affine: whether there are a scale and a shift to learn.
+        first: whether what comes in is of any size. What float32 cannot square is scaled before: a variance that
+            overflows would make a constant of it.
     """
 
     weight: nn.Parameter | None
     bias: nn.Parameter | None
 
-    def __init__(self, copies: int, shape: tuple[int, ...], dtype: torch.dtype, affine: bool = True) -> None:
+    def __init__(
+        self, copies: int, shape: tuple[int, ...], dtype: torch.dtype, affine: bool = True, *, first: bool = False
+    ) -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.first = shape, first
         self.weight = nn.Parameter(torch.ones(copies, *shape, dtype=dtype)) if affine else None
         self.bias = nn.Parameter(torch.zeros(copies, *shape, dtype=dtype)) if affine else None
 
     def forward(self, x: Tensor) -> Tensor:
         """``[copies, B, *shape] -> [copies, B, *shape]``."""
+        if self.first:  # the mean and spread of x / 1 are those of x, bit for bit
+            axes = tuple(range(-len(self.shape), 0))
+            x = x / (x.detach().abs().amax(axes, keepdim=True) * _SQUARABLE).clamp(min=1.0)
         hat = nn.functional.layer_norm(x, self.shape)
         return hat if self.weight is None or self.bias is None else hat * self.weight[:, None] + self.bias[:, None]
 
@@ -140,7 +148,7 @@ class Trunk(nn.Module):
             gain = None if body.init == "uniform" else _HE if i < len(sizes) - 2 else _LAST
             layers.append(GroupedLinear(copies, below, above, rng, dtype, body.sparsity, gain))
             if body.layer_norm and i < len(sizes) - 2:
-                norms.append(GroupedLayerNorm(copies, (above,), dtype, body.affine))
+                norms.append(GroupedLayerNorm(copies, (above,), dtype, body.affine, first=i == 0))
         self.layers = nn.ModuleList(layers)
         self.norms = nn.ModuleList(norms)
 
@@ -185,7 +193,7 @@ class GroupedConv(nn.Module):
             weights.append(weight)
             biases.append(bias)
             if body.layer_norm:
-                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine))
+                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine, first=not norms))
             channels = fan_out
         self.weights = nn.ParameterList(weights)
         self.biases = nn.ParameterList(biases)

@@ -122,10 +122,11 @@ class Session:
             Diverged: if they are not.
         """
         if not bool(torch.isfinite(self.learner.engine.flat.values).all()):
+            longest = getattr(getattr(self.learner, "settings", None), "lambda_", 0.0) == 1
             raise Diverged(
                 f"after {self.env_steps:,} environment steps the parameters are no longer finite: training "
-                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
-                "or λ nearer 1"
+                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, "
+                + ("smaller rewards or a target network" if longest else "a target network or λ nearer 1")
             )
 
     def state_dict(self) -> dict[str, Any]:

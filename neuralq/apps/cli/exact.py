@@ -44,7 +44,8 @@ def solve(argv: list[str]) -> int:
             raise Failure(f"{options.env} names no rows and columns, so there is no grid to draw; leave out --svg")
         page = ChapterPage("solve", f"{options.env}, γ = {options.gamma:g}", "", (), (), (grid,))
         Path(options.svg).write_text(page_svg(page), encoding="utf-8")
-    actions = [np.flatnonzero(row).tolist() for row in solution.optimal_actions]
+    known = solution.separated
+    actions = [np.flatnonzero(row).tolist() if known[s] else None for s, row in enumerate(solution.optimal_actions)]
     plain = {
         "env": options.env,
         "gamma": options.gamma,
@@ -79,7 +80,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99)")
     parser.add_argument("--method", default="auto", choices=METHODS, help="how to solve it (default: auto)")
-    parser.add_argument("--tol", type=float, default=1e-8, help="guaranteed largest error of V (default: 1e-8)")
+    parser.add_argument(
+        "--tol",
+        type=float,
+        help="guaranteed largest error of V, times the largest |V| where rounding allows no less (default: 1e-8, or a "
+        "millionth of the largest |reward| where that is less)",
+    )
     parser.add_argument(
         "--max-iterations", type=int, metavar="N", help="stop after so many (default: when it is solved)"
     )
@@ -132,7 +138,8 @@ class _Layout(NamedTuple):
             elif mdp.is_terminal[s]:
                 cells.append(Square("end") if entered[s] else Square(wall=True))
             else:
-                best = sorted(self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
+                known = np.flatnonzero(solution.optimal_actions[s]) if solution.separated[s] else ()
+                best = sorted(self.directions[a] for a in known)
                 arrows = tuple(map(Arrow, best))
                 cells.append(Square(short(float(solution.v[s])), arrows))
         return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
@@ -175,13 +182,14 @@ def _legend(layout: _Layout) -> str:
 
 
 def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
-    names = mdp.state_names or [""] * mdp.num_states
+    names, known = mdp.state_names or [""] * mdp.num_states, solution.separated
     lines = ["state        V*  optimal actions"]
     for s in range(min(len(solution.v), _MOST_ROWS)):
         chosen = np.flatnonzero(solution.optimal_actions[s])
         actions = (
             " ".join(str(a) if mdp.action_names is None else mdp.action_names[int(a)] for a in chosen) or "terminal"
         )
+        actions = actions if known[s] else "not known"
         lines.append(f"{s:5d}  {solution.v[s]:8.4f}  {actions}{f'  ({names[s]})' if names[s] else ''}")
     if len(solution.v) > _MOST_ROWS:
         lines.append(f"… and {len(solution.v) - _MOST_ROWS} more states (--json has them all)")
@@ -189,8 +197,11 @@ def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
 
 
 def _summary(solution: Solution) -> list[str]:
-    count = count_optimal_policies(solution)
-    policies = f"{count:,}" if count < 1e9 else f"about 10^{len(str(count)) - 1}"
+    if solution.separated.all():
+        count = count_optimal_policies(solution)
+        policies = f"{count:,}" if count < 1e9 else f"about 10^{len(str(count)) - 1}"
+    else:
+        policies = f"not known: the bound separates no actions in {np.count_nonzero(~solution.separated):,} states"
     return [
         f"deterministic optimal policies: {policies}",
         f"{solution.method}: {solution.iterations} iterations, {solution.seconds:.3f} s, "

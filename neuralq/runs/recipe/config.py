@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from numbers import Real
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
@@ -140,6 +140,7 @@ class RunConfig:
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
                     f"use learner={name!r} or leave them out"
                 )
+        object.__setattr__(self, self.learner, _fitted_settings(self.learner, self.settings, self.kind.settings))
         _check_body(self)
         _check_outputs(self)
         self.kind.check(self.settings, self)
@@ -250,6 +251,16 @@ def _body_of(given: Any) -> dict[str, Any]:
             f"body must be a mapping with a class, one of {known}, or 'module:Class' of your own, got {given!r}"
         )
     return dict(given)
+
+
+def _fitted_settings(place: str, settings: Any, known: type) -> Any:
+    """``settings`` with every value of its field's kind: 1.0 is a whole number too, but no length of an array."""
+    if not isinstance(settings, known):
+        raise ValueError(f"{place} must be {known.__name__}, got {settings!r}")
+    given = {one.name: getattr(settings, one.name) for one in dataclasses.fields(cast(Any, known))}
+    fitted = _fitted(place, given, known)
+    same = all(type(fitted[name]) is type(value) for name, value in given.items())
+    return settings if same else dataclasses.replace(cast(Any, settings), **fitted)
 
 
 def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:
