@@ -127,7 +127,6 @@ class Kind(Generic[C, T, R]):
             contextlib.closing(self.build(config)) as trainee,
         ):
             progress = continued(trainee, folder)
-            folder.truncate_metrics(trainee.env_steps)
             if budget is not None:
                 folder.replace_config(self.to_plain(config))
             return self._finish(config, trainee, progress, folder, hooks)

@@ -16,7 +16,7 @@ import numpy as np
 from neuralq.learners.learner import Learner
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import Best, keep_best
-from neuralq.runs.folder.run_folder import RunFolder
+from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream.experience import Sample
 
@@ -183,13 +183,18 @@ def seed_for(seed: int, *purpose: int) -> int:
 def continued(trainee: Trainee, folder: RunFolder) -> Progress:
     """How far the run in a folder has come, with ``trainee``, freshly built, put where its newest checkpoint stood.
 
+    Rows of metrics beyond the checkpoint are dropped.
+
     Raises:
         CheckpointError: if there are checkpoints and none is intact.
     """
     if not any(folder.checkpoints_path.glob("step-*")):
+        folder.truncate_metrics(trainee.env_steps)
         return Progress()
     state = checkpoint.load_newest(folder.checkpoints_path).state
     trainee.load_state_dict(state)
+    folder.truncate_metrics(trainee.env_steps)
+    warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))
     known = {f.name for f in fields(Progress)}
     return Progress(**{name: value for name, value in state["progress"].items() if name in known})
 
@@ -318,4 +323,5 @@ class _Loop:
         self._book()
         state = self.trainee.state_dict()
         state["progress"] |= {name: value for name, value in asdict(self.progress).items() if value is not None}
+        state["progress"]["num_rows"] = self.folder.num_rows
         checkpoint.save(self.folder.checkpoints_path, self.trainee.env_steps, state)

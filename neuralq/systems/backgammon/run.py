@@ -20,6 +20,7 @@ import numpy as np
 
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import Best
+from neuralq.runs.folder.files import replacing
 from neuralq.runs.folder.run_folder import RunFolder, RunFolderError, default_run_path, read_config
 from neuralq.runs.kinds import CommandLine, Kind, kind_in
 from neuralq.runs.loop import Diverged, Hook, Plan, Progress
@@ -162,9 +163,8 @@ def _default_path(config: TdGammonConfig) -> Path:
 def _result(config: TdGammonConfig, trainee: _Trainee, progress: Progress, folder: RunFolder) -> GammonRun:
     network = trainee.learner.network
     notes = {"games": str(trainee.amount), "seed": str(config.seed), "mode": config.settings.mode}
-    partial = folder.path / f".partial-{WEIGHTS_NAME}"
-    network.save(partial, notes)
-    partial.replace(folder.path / WEIGHTS_NAME)
+    with replacing(folder.path / WEIGHTS_NAME) as temporary:
+        network.save(temporary, notes)
     return GammonRun(
         run_dir=folder.path,
         games=trainee.amount,
