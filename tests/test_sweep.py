@@ -321,12 +321,12 @@ def test_wrong_usage_is_refused(argv: list[str], said: str, capsys: pytest.Captu
 def test_the_words_of_the_command_line_reach_each_seed(tmp_path: Path) -> None:
     sweep = create_sweep(tmp_path / "sweep", CONFIG, [7], ["--tensorboard"])
     words = sweeps._command(open_sweep(sweep.path), 7)
-    assert words[3:6] == ["train", "--config", str(sweep.path / "config.json")]
+    assert words[4:7] == ["train", "--config", str(sweep.path / "config.json")]
     assert words[words.index("--seed") + 1] == "7" and words[-1] == "--tensorboard"
     assert words[words.index("--run-dir") + 1] == str(sweep.path / "seed-7")
     run_sweep(sweep, Children())
     words = sweeps._command(sweep, 7)
-    assert words[3:] == ["resume", str(sweep.path / "seed-7"), "--total-steps", "1000"]
+    assert words[4:] == ["resume", str(sweep.path / "seed-7"), "--total-steps", "1000"]
 
 
 @pytest.mark.slow

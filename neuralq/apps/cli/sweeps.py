@@ -15,6 +15,7 @@ from neuralq.apps.cli.kinds import say
 from neuralq.apps.cli.options import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
+from neuralq.runs.children import python_command
 from neuralq.runs.folder.run_folder import default_run_path, is_run_folder
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
@@ -103,7 +104,7 @@ def child() -> None:
 
 
 def _command(sweep: Sweep, seed: int) -> list[str]:
-    begin = [sys.executable, "-c", _CHILD]
+    begin = python_command(_CHILD)
     path = str(sweep.run_path(seed))
     if is_run_folder(path):
         options = list(sweep.options)

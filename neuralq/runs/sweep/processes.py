@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -250,10 +249,10 @@ def stop_with_parent() -> None:
 
 
 def _environment(num_threads: int) -> dict[str, str]:
-    """The parent's, with its module path and a bound on threads, which libraries read when they are loaded."""
+    """The parent's, with a bound on threads, which libraries read when they are loaded."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     limits = dict.fromkeys(names, str(num_threads))
-    return {**os.environ, **limits, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
+    return {**os.environ, **limits}
 
 
 def _reason(log: Path, status: int) -> str:
