@@ -1,6 +1,6 @@
 """Processes of our own: they look for modules where this one does, the standard library's and installed ones first.
 
-A child of ``python -c`` or of `multiprocessing` looks into the present folder before anything else, and so does one whose
+A child of ``python -c`` or `multiprocessing` looks into the present folder before anything else, and so does one whose
 PYTHONPATH names it: a ``queue.py`` that lies beside the user would be imported in place of the standard library's, and
 run. Folders of the user's own are searched last.
 """
