@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import itertools
 import os
 import platform
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -46,6 +47,7 @@ __all__ = [
     "RunFolder",
     "RunFolderBusy",
     "RunFolderError",
+    "claimed",
     "default_run_path",
     "is_run_folder",
     "library_versions",
@@ -81,6 +83,10 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.config: dict[str, Any] = {}
+        """The effective configuration, as ``config.json`` has it."""
+        self.free: frozenset[str] = frozenset()
+        """Names of the configuration that do not decide what is learned: checkpoints do not depend on them."""
         self._lock = FolderLock(path / "run.lock", f"{path} is being written")
         self._num_rows: int | None = None
 
@@ -102,6 +108,7 @@ class RunFolder:
         try:
             refuse_old_run(path)
             run._clear()
+            run.config = dict(config)
             write_durably(path / "config.json", document)
             write_durably(path / "versions.json", to_json(library_versions(), "versions", sealed=True))
             marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seed": int(seed)}
@@ -124,6 +131,7 @@ class RunFolder:
         run = cls(path)
         try:
             run._clear()
+            run.config = read_json(path / "config.json")
             _cut_torn_line(run.metrics_path)
         except BaseException:
             run.close()
@@ -188,6 +196,7 @@ class RunFolder:
         """The effective configuration from now on (a resumed run may have a new budget), replaced in one step."""
         self._check_open()
         write_durably(self.path / "config.json", to_json(config, "config"))
+        self.config = dict(config)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """The final result, replaced in one step; NaN and infinities become null.
@@ -231,6 +240,38 @@ def default_run_path(env_id: str, layout: str, seed: int, timestamp: datetime, r
     """
     slug = re.sub(r"[^A-Za-z0-9._]+", "-", f"{env_id}-{layout}")[:120].strip(".-") or "run"
     return Path(root) / f"{slug}-s{int(seed)}-{timestamp:%Y%m%d-%H%M%S}"
+
+
+@contextlib.contextmanager
+def claimed(run_dir: str | Path | None, default: Callable[[], Path]) -> Iterator[Path]:
+    """The folder for a run: the one that is named, or one that is made here and that nobody else is given.
+
+    Two runs that begin within one second have one default path; the later one gets a number behind it. Where the block
+    fails before anything is in it, the folder is removed.
+
+    Example:
+        >>> import tempfile
+        >>> root = Path(tempfile.mkdtemp())
+        >>> with claimed(None, lambda: root / "run"), claimed(None, lambda: root / "run") as path:
+        ...     path.name
+        'run-2'
+    """
+    if run_dir is not None:
+        yield Path(run_dir)
+        return
+    first = path = default()
+    for number in itertools.count(2):
+        try:
+            path.mkdir(parents=True)
+            break
+        except FileExistsError:
+            path = first.with_name(f"{first.name}-{number}")
+    try:
+        yield path
+    except BaseException:
+        with contextlib.suppress(OSError):  # something is in it
+            path.rmdir()
+        raise
 
 
 def library_versions() -> dict[str, str]:

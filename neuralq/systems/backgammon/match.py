@@ -224,7 +224,10 @@ def _blocks(
         ThreadPoolExecutor(workers) if compiled else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     )
     with safe_path(), pool:
-        yield from zip(starts, pool.map(_play_block, tasks), strict=True)
+        try:
+            yield from zip(starts, pool.map(_play_block, tasks), strict=True)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # whoever leaves early waits for no more than has begun
 
 
 def _play_block(task: tuple[_Sides, range, int, bool]) -> NDArray[np.int64]:
