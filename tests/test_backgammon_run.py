@@ -27,7 +27,7 @@ from neuralq.apps.cli import main
 from neuralq.runs.folder.run_folder import RunFolderError, read_config, read_metrics, read_summary
 from neuralq.systems.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
 from neuralq.systems.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
-from neuralq.systems.backgammon.run import GammonRun, load_agent, resume_games, train_games
+from neuralq.systems.backgammon.run import TD_GAMMON, GammonRun, load_agent, resume_games, train_games
 from neuralq_envs.backgammon import Position
 
 ROOT = Path(__file__).parents[1]
@@ -82,10 +82,11 @@ def test_a_run_stopped_anywhere_ends_as_if_it_had_not_been(settings: SelfPlaySet
         assert clockless(path) == clockless(tmp_path / "whole")
     path = tmp_path / "asked"
     asked = 30 if settings.mode == "batched" else 20  # between two checkpoints
-    first = train_games(config, path, [at(asked, lambda: os.kill(os.getpid(), signal.SIGTERM))])
+    first = TD_GAMMON.train(config, path, [at(asked, lambda: os.kill(os.getpid(), signal.SIGTERM))])
     assert (first.interrupted_by, first.games) == ("SIGTERM", asked)
     assert outcome(resume_games(path)) == outcome(whole) and clockless(path) == clockless(tmp_path / "whole")
-    assert outcome(resume_games(path)) == outcome(whole)  # a finished run stays as it is
+    with pytest.warns(UserWarning, match="nothing is left to do"):
+        assert outcome(resume_games(path)) == outcome(whole)  # a finished run stays as it is
 
 
 def test_the_rows_say_what_the_games_were_and_the_weights_are_the_learners(tmp_path: Path) -> None:
@@ -180,7 +181,8 @@ def test_what_was_learned_plays(tmp_path: Path) -> None:
         load_agent(tmp_path)
     with pytest.raises(ValueError, match="is a TD-Gammon run, whose budget is num_games and not total_steps"):
         neuralq.resume(run.run_dir, total_steps=10**6)
-    assert neuralq.resume(run.run_dir) == run  # finished, and stays as it is
+    with pytest.warns(UserWarning, match="nothing is left to do"):
+        assert neuralq.resume(run.run_dir) == run  # finished, and stays as it is
 
 
 def test_weights_that_are_no_numbers_are_not_saved(tmp_path: Path) -> None:

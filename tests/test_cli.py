@@ -98,6 +98,7 @@ def test_no_command_and_an_unknown_command(capsys: Capture) -> None:
 # Results.
 
 
+@pytest.mark.filterwarnings("default:nothing is left to do")
 def test_train_and_resume_end_with_one_json_object(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "run"
     results = []
@@ -122,6 +123,7 @@ def test_the_result_for_people_goes_to_standard_output_and_the_rest_beside_it(tm
     assert "resumes bit-exact" in captured.err
 
 
+@pytest.mark.filterwarnings("default:nothing is left to do")
 @pytest.mark.parametrize(("target", "status"), [("5", 0), ("499", 1)])
 def test_the_exit_status_says_whether_the_target_was_reached(
     target: str, status: int, tmp_path: Path, capsys: Capture

@@ -173,7 +173,8 @@ def test_a_kind_of_ones_own_is_trained_resumed_and_loaded(tmp_path: Path) -> Non
     assert list(first) == [
         "kind", "env_steps", "games", "cpu_seconds", "wall_seconds", "games_per_second", "half",
     ]  # fmt: skip
-    assert neuralq.resume(tmp_path / "run") == run  # finished, and stays as it is
+    with pytest.warns(UserWarning, match="nothing is left to do: .* has spent its budget of 32 games"):
+        assert neuralq.resume(tmp_path / "run") == run  # finished, and stays as it is
     assert COUNTING.resume(tmp_path / "run", 45).env_steps == 450
     assert rows(tmp_path / "run", "train") == [10, 20, 30, 32, 40, 45]
     assert read_config(tmp_path / "run")["num_games"] == 45 and read_summary(tmp_path / "run")["env_steps"] == 450

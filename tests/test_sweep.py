@@ -22,6 +22,7 @@ import pytest
 
 from neuralq.apps.cli import main, sweeps
 from neuralq.apps.cli.sweeps import sweep_bar
+from neuralq.runs.folder.files import read_json
 from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
 from neuralq.runs.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
 from neuralq.runs.sweep import processes as processes_module
@@ -93,7 +94,7 @@ def test_every_seed_runs_once_and_the_result_is_their_interquartile_mean(tmp_pat
     assert plain["iqm"] == 20.0  # (10 + 20 + 30) / 3
     assert plain["low"] < 20.0 < plain["high"] and plain["num_finished"] == 5
     assert plain["runs"][3]["seed"] == 3 and plain["runs"][3]["env_steps"] == 1000
-    assert json.loads((sweep.path / "summary.json").read_text()) == plain
+    assert read_json(sweep.path / "summary.json") == plain
     assert max(len(status.running) for status in seen) == 2
     assert (seen[-1].env_steps, seen[-1].total_steps, seen[-1].num_finished) == (5000, 5000, 5)
     assert seen[-1].returns == (0.0, 10.0, 20.0, 30.0, 40.0)
@@ -320,12 +321,12 @@ def test_wrong_usage_is_refused(argv: list[str], said: str, capsys: pytest.Captu
 def test_the_words_of_the_command_line_reach_each_seed(tmp_path: Path) -> None:
     sweep = create_sweep(tmp_path / "sweep", CONFIG, [7], ["--tensorboard"])
     words = sweeps._command(open_sweep(sweep.path), 7)
-    assert words[3:6] == ["train", "--config", str(sweep.path / "config.json")]
+    assert words[4:7] == ["train", "--config", str(sweep.path / "config.json")]
     assert words[words.index("--seed") + 1] == "7" and words[-1] == "--tensorboard"
     assert words[words.index("--run-dir") + 1] == str(sweep.path / "seed-7")
     run_sweep(sweep, Children())
     words = sweeps._command(sweep, 7)
-    assert words[3:] == ["resume", str(sweep.path / "seed-7"), "--total-steps", "1000"]
+    assert words[4:] == ["resume", str(sweep.path / "seed-7"), "--total-steps", "1000"]
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from neuralq.runs.control import CONTROL, Run
 from neuralq.runs.kinds import kind_of
 from neuralq.runs.loop import Hook
 from neuralq.runs.recipe.config import RunConfig
+from neuralq.runs.stop_request import pass_on
 
 __all__ = ["load", "resume", "train"]
 
@@ -27,6 +28,7 @@ def train(config: RunConfig, run_dir: str | Path | None = None, hooks: Sequence[
         RunFolderError: if the folder already holds a run.
         EnvironmentFault: if the environment breaks its contract while training.
         Diverged: if the parameters stop being finite.
+        KeyboardInterrupt: at Ctrl-C, once the run is saved; another signal has its effect then, too.
 
     Example:
         >>> import tempfile
@@ -36,10 +38,11 @@ def train(config: RunConfig, run_dir: str | Path | None = None, hooks: Sequence[
         >>> train(config, run_dir=tempfile.mkdtemp() + "/run").env_steps >= 64
         True
     """
-    return CONTROL.train(config, run_dir, hooks)
+    run: Run = _passed_on(CONTROL.train(config, run_dir, hooks))
+    return run
 
 
-def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[Hook] = ()) -> Any:
+def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[Hook] = (), **changes: Any) -> Any:
     """Go on with a run from its newest valid checkpoint, or from the start if it was stopped before the first.
 
     On a CPU the continued run ends with the same bits as one that was never stopped, where the environment's state can
@@ -50,14 +53,17 @@ def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[
         total_steps: a new budget, which becomes part of the run's configuration; a finished run goes on only with a
             larger one.
         hooks: called with every row of metrics.
+        changes: other settings that do not decide what is learned, which become part of the configuration, too:
+            ``device="cpu"``, ``stop_at_return=None``, ``evaluate_every=10_000``, ….
 
     Returns:
         A `Run`; of a system's run the result that the system has for it.
 
     Raises:
         RunFolderError: if there is no run, or another process is writing it.
-        CheckpointError: if no checkpoint is intact.
-        ValueError: for a new budget of a run that does not count environment steps.
+        CheckpointError: if no checkpoint is intact, or the newest belongs to another configuration.
+        ValueError: for a new budget of a run that does not count environment steps, one that is spent already, and for
+            changes that would make another run of it.
     """
     kind = kind_of(run_dir)
     if total_steps is not None and kind.budget != "total_steps":
@@ -65,7 +71,15 @@ def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[
             f"{run_dir} is {kind.title}, whose budget is {kind.budget} and not total_steps; leave it out here, or "
             "resume the run as its system does"
         )
-    return kind.resume(run_dir, total_steps, hooks)
+    return _passed_on(kind.resume(run_dir, total_steps, hooks, changes))
+
+
+def _passed_on(run: Any) -> Any:
+    """The run, unless a signal has ended it: what it was meant to end is the whole program."""
+    pass_on(
+        run.interrupted_by, f"the run was saved at {run.env_steps:,} steps; go on with: neuralq resume {run.run_dir}"
+    )
+    return run
 
 
 def load(run_dir: str | Path, best: bool = False) -> Any:

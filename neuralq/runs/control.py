@@ -20,9 +20,10 @@ from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
+from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
 from neuralq.runs.kinds import Kind, limited_threads
-from neuralq.runs.loop import Progress, seed_for
+from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.recipe.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.session import Session
@@ -83,7 +84,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         parameters_sha256=session.learner.engine.flat.sha256(),
         reached=None if config.stop_at_return is None else progress.reached_at is not None,
         interrupted_by=progress.interrupted_by,
-        resumability=session.resumability.reason,
+        resumability=session.resumability.reason if progress.moved is None else f"{NOT_EXACT}: {progress.moved}",
         engine=engine_name(session.learner),
     )
 
@@ -112,7 +113,9 @@ def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
     if best:
         kept = load_best(run_dir)
         return kept.parameters, kept.normalisation
-    saved = checkpoint.load_newest(run_dir / "checkpoints").state
+    newest = checkpoint.load_newest(run_dir / "checkpoints")
+    saved = newest.state
+    compared(saved.get("origin"), read_config(run_dir), newest.path)
     state = saved["learner"]
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
@@ -138,7 +141,9 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
         try:
             stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
             with torch.no_grad():
-                return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7))
+                return evaluate_greedy(
+                    agent.q.all, stream, num_episodes, seed_for(seed, 7), config.evaluation_max_steps
+                )
         finally:
             envs.close()
 
@@ -157,6 +162,9 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     return notes
 
 
+_CHANGEABLE = frozenset(
+    "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every".split()
+)
 CONTROL = Kind(
     name="control",
     title="a run on an environment",
@@ -171,4 +179,5 @@ CONTROL = Kind(
     result=_result,
     load=_load_agent,
     notes=_notes,
+    changeable=_CHANGEABLE,
 )

@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from neuralq.checks import check_whole
+from neuralq.runs.stop_request import raise_if_asked
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.acting import choose_greedy
 
@@ -77,6 +78,9 @@ def evaluate_greedy(
 
     Returns:
         Returns and lengths in the order of environments.
+
+    Raises:
+        StopAsked: if a signal asks for the end and the evaluation may be abandoned.
     """
     check_whole("num_episodes", num_episodes)
     returns: list[float] = []
@@ -88,6 +92,7 @@ def evaluate_greedy(
         first: dict[int, tuple[float, int]] = {}
         missing = set(range(wanted))
         for _ in range(max_steps):
+            raise_if_asked()
             for episode in stream.step(lambda s: choose_greedy(values(s))).episodes:
                 if episode.env_index in missing:
                     first[episode.env_index] = (episode.episode_return, episode.length)

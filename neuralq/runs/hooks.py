@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from neuralq.checks import MissingExtra
+from neuralq.runs.folder.files import write_durably
 
 __all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
 
@@ -95,7 +96,7 @@ class WeightsAndBiases:
         kept = folder / "wandb" / "neuralq-run-id"
         if not kept.exists():
             kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(secrets.token_hex(8))
+            write_durably(kept, secrets.token_hex(8))
         try:
             self._run: Any = wandb.init(
                 project=project, name=folder.name, id=kept.read_text(), resume="allow", dir=str(folder),

@@ -8,17 +8,22 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import signal
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from threadpoolctl import threadpool_limits
 
 from neuralq.runs.folder.files import RunFolderError
-from neuralq.runs.folder.run_folder import RunFolder, is_run_folder, read_config, refuse_old_run
+from neuralq.runs.folder.origin import ARITHMETIC
+from neuralq.runs.folder.run_folder import RunFolder, claimed, is_run_folder, read_config, refuse_old_run
 from neuralq.runs.loop import Hook, Plan, Progress, Trainee, continued, fit
+from neuralq.runs.stop_request import StopRequest
 
 __all__ = ["KINDS", "Kind", "Result", "kind_in", "kind_named", "kind_of", "limited_threads"]
 
@@ -41,6 +46,8 @@ class Result(Protocol):
         ...
 
 
+Changes = Mapping[str, Any]
+NO_CHANGES: Changes = MappingProxyType({})
 C = TypeVar("C")
 T = TypeVar("T", bound=Trainee)
 R = TypeVar("R", bound=Result)
@@ -85,6 +92,7 @@ class Kind(Generic[C, T, R]):
         result: of a run that has ended; may leave files of its own in the folder.
         load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
+        changeable: fields that do not decide what is learned: a run may go on with other values.
         command: what the command line has to know to train by options of the kind's own.
     """
 
@@ -101,49 +109,113 @@ class Kind(Generic[C, T, R]):
     result: Callable[[C, T, Progress, RunFolder], R]
     load: Callable[[Path, bool], Any]
     notes: Callable[[C, Mapping[str, Any]], list[str]]
+    changeable: frozenset[str] = frozenset()
     command: CommandLine | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
-        path = self.default_path(config) if run_dir is None else Path(run_dir)
-        refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
-        plain, seed = self.to_plain(config), self.plan(config).seed
-        with limited_threads(self.num_threads(config)), contextlib.closing(self.build(config)) as trainee:
-            with RunFolder.create(path, config=plain, seed=seed) as folder:
-                return self._finish(config, trainee, Progress(), folder, hooks)
+        plain, seed, request = self.to_plain(config), self.plan(config).seed, StopRequest()
+        with claimed(run_dir, lambda: self.default_path(config)) as path:
+            refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
+            with (
+                request.listening((signal.SIGINT,)),
+                limited_threads(self.num_threads(config)),
+                contextlib.closing(self.build(config)) as trainee,
+            ):
+                _end_if_asked(request)
+                with RunFolder.create(path, config=plain, seed=seed) as folder:
+                    folder.free = self.free
+                    result = self._finish(config, trainee, Progress(), folder, hooks)
+                _end_if_asked(request)
+                return result
 
-    def resume(self, run_dir: str | Path, budget: int | None = None, hooks: Sequence[Hook] = ()) -> R:
+    def resume(
+        self, run_dir: str | Path, budget: int | None = None, hooks: Sequence[Hook] = (), changes: Changes = NO_CHANGES
+    ) -> R:
         """As `neuralq.resume`.
 
         Raises:
-            ValueError: if the run is of another kind.
+            ValueError: if the run is of another kind, or a change is not one that it can take.
         """
-        config = self.from_plain(read_config(run_dir))
-        if budget is not None:
-            config = self.with_budget(config, budget)
+        stored, request = self.from_plain(read_config(run_dir)), StopRequest()
+        config = self.changed(stored, budget, changes)
         with (
+            request.listening((signal.SIGINT,)),
             limited_threads(self.num_threads(config)),
             RunFolder.open(run_dir) as folder,
             contextlib.closing(self.build(config)) as trainee,
         ):
+            _end_if_asked(request)
+            folder.free = self.free
             progress = continued(trainee, folder)
-            folder.truncate_metrics(trainee.env_steps)
-            if budget is not None:
+            plan, before = self.plan(config), self.plan(stored)
+            if trainee.amount > plan.budget and plan.budget < before.budget:
+                raise ValueError(
+                    f"{self.budget}={budget} is less than what {run_dir} has spent, {trainee.amount:,}; name more than "
+                    "that, or leave it out"
+                )
+            if plan.stop_at_return != before.stop_at_return:
+                score, target = progress.greedy_return, plan.stop_at_return
+                met = score is not None and target is not None and score >= target
+                progress.reached_at = progress.evaluated_at if met else None
+            if config != stored:
                 folder.replace_config(self.to_plain(config))
-            return self._finish(config, trainee, progress, folder, hooks)
+            result = self._finish(config, trainee, progress, folder, hooks)
+            _end_if_asked(request)
+            return result
 
-    def with_budget(self, config: C, budget: int) -> C:
-        """The same configuration but for how much training there is."""
-        return dataclasses.replace(config, **{self.budget: budget})  # type: ignore[type-var]  # it is a dataclass
+    @property
+    def free(self) -> frozenset[str]:
+        """Names of the configuration that do not decide what is learned."""
+        return self.changeable | {self.budget}
+
+    def changed(self, config: C, budget: int | None, changes: Changes = NO_CHANGES) -> C:
+        """The same configuration but for how much training there is, and what else does not decide what is learned.
+
+        Raises:
+            ValueError: for anything else, which would make another run of it.
+        """
+        known = self.changeable | (ARITHMETIC & {f.name for f in dataclasses.fields(self.config)})  # type: ignore[arg-type]
+        for name in changes:
+            if name not in known:
+                raise ValueError(
+                    f"{name} cannot be changed where {self.title} goes on: it would be another run; what can is "
+                    f"{', '.join(sorted(known))}"
+                )
+        values = dict(changes) | ({} if budget is None else {self.budget: budget})
+        return dataclasses.replace(config, **values)  # type: ignore[type-var]  # it is a dataclass
 
     def _finish(self, config: C, trainee: T, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]) -> R:
         plan = self.plan(config)
         reached = plan.stop_at_return is not None and progress.reached_at is not None
         if not (progress.finished and (reached or trainee.amount >= plan.budget)):
             fit(trainee, plan, progress, folder, hooks)
+        else:
+            warnings.warn(_nothing_left(self, plan, progress, folder.path, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)
         folder.write_summary(result.plain())
         return result
+
+
+def _end_if_asked(request: StopRequest) -> None:
+    """Raises KeyboardInterrupt if Ctrl-C came while a run was prepared or put away: a compiler may swallow it there."""
+    if request.name is not None:
+        raise KeyboardInterrupt
+
+
+def _nothing_left(kind: Kind[Any, Any, Any], plan: Plan, progress: Progress, path: Path, reached: bool) -> str:
+    unit = plan.unit.replace("_", " ")
+    if reached:
+        return (
+            f"nothing is left to do: {path} has reached its target of {plan.stop_at_return:g} at "
+            f"{progress.reached_at:,} {unit}; to go on, set a higher one or none: neuralq resume {path} "
+            "--stop-at-return none"
+        )
+    option = "--games" if kind.budget == "num_games" else "--" + kind.budget.replace("_", "-")
+    return (
+        f"nothing is left to do: {path} has spent its budget of {plan.budget:,} {unit}; to go on, give it a larger "
+        f"one: neuralq resume {path} {option} {2 * plan.budget}"
+    )
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ its `Progress`; a checkpoint holds exactly the first and the last, so a run that
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, runtime_checkable
@@ -14,13 +15,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from neuralq.learners.learner import Learner
-from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder import checkpoint, origin
 from neuralq.runs.folder.best import Best, keep_best
-from neuralq.runs.folder.run_folder import RunFolder
-from neuralq.runs.stop_request import StopRequest
+from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
+from neuralq.runs.stop_request import StopAsked, StopRequest
 from neuralq.runs.stream.experience import Sample
 
 __all__ = [
+    "NOT_EXACT",
     "Diverged",
     "Hook",
     "Observer",
@@ -31,6 +33,9 @@ __all__ = [
     "fit",
     "seed_for",
 ]
+
+
+NOT_EXACT = "the run goes on from the state that was saved, but not with the same bits for certain"
 
 
 class Hook(Protocol):
@@ -155,6 +160,7 @@ class Progress:
         reached_at: amount at which ``stop_at_return`` was first met.
         finished: whether the run has ended by itself.
         interrupted_by: name of the signal that ended it early.
+        moved: what decides the arithmetic and was not the same all along, in words.
     """
 
     cpu_seconds: float = 0.0
@@ -168,6 +174,7 @@ class Progress:
     next_checkpoint: int = 0
     next_log: int = 0
     interrupted_by: str | None = None
+    moved: str | None = None
 
 
 def seed_for(seed: int, *purpose: int) -> int:
@@ -183,15 +190,26 @@ def seed_for(seed: int, *purpose: int) -> int:
 def continued(trainee: Trainee, folder: RunFolder) -> Progress:
     """How far the run in a folder has come, with ``trainee``, freshly built, put where its newest checkpoint stood.
 
+    Rows of metrics beyond the checkpoint are dropped. What computes otherwise than it did is named in a warning.
+
     Raises:
-        CheckpointError: if there are checkpoints and none is intact.
+        CheckpointError: if there are checkpoints and none is intact, or the newest belongs to another configuration.
     """
     if not any(folder.checkpoints_path.glob("step-*")):
+        folder.truncate_metrics(trainee.env_steps)
         return Progress()
-    state = checkpoint.load_newest(folder.checkpoints_path).state
+    saved = checkpoint.load_newest(folder.checkpoints_path)
+    state = saved.state
+    moved = origin.compared(state.get("origin"), folder.config, saved.path)
     trainee.load_state_dict(state)
+    folder.truncate_metrics(trainee.env_steps)
+    warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))
     known = {f.name for f in fields(Progress)}
-    return Progress(**{name: value for name, value in state["progress"].items() if name in known})
+    progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
+    if moved is not None:
+        progress.moved = moved if progress.moved is None else f"{progress.moved}; {moved}"
+        warnings.warn(f"{NOT_EXACT}: {moved}", stacklevel=2)
+    return progress
 
 
 def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> None:
@@ -213,6 +231,9 @@ def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hoo
     with request.listening():
         try:
             loop.run(request)
+        except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
+            loop._book(training=False)
+            loop.interrupted(request)
         except ValueError:  # NaN among the values: the policy notices before the next checkpoint would
             trainee.require_finite()
             raise
@@ -234,26 +255,33 @@ class _Loop:
 
     def run(self, request: StopRequest) -> None:
         trainee, plan, progress = self.trainee, self.plan, self.progress
-        while trainee.amount < plan.budget:
+        if 0 < progress.next_evaluation <= trainee.amount:  # one was abandoned
+            self._evaluate(request)
+        reached = plan.stop_at_return is not None and progress.reached_at is not None
+        while not reached and trainee.amount < plan.budget:
             next_look = min(progress.next_log, progress.next_evaluation, progress.next_checkpoint, plan.budget)
             trainee.advance(next_look, request)
             amount = trainee.amount
             if amount >= progress.next_log or (plan.log_whole_periods and amount >= plan.budget):
                 self._log()
             if amount >= progress.next_evaluation:
-                self._evaluate()
-                if plan.stop_at_return is not None and progress.reached_at is not None:
-                    break
+                self._evaluate(request)
+                reached = plan.stop_at_return is not None and progress.reached_at is not None
+            if reached:
+                break
             if request.name is not None:
-                progress.interrupted_by = request.name
-                self._save()
+                self.interrupted(request)
                 return
             if amount >= progress.next_checkpoint:
-                self._save()
+                self._save(request)
         if progress.evaluated_at != trainee.amount:
-            self._evaluate()
+            self._evaluate(request)
         progress.finished = True
-        self._save()
+        self._save(request)
+
+    def interrupted(self, request: StopRequest) -> None:
+        self.progress.interrupted_by = request.name
+        self._save(request)
 
     def _book(self, training: bool = True) -> None:
         """Books the time since this was last called; what is no training counts as wall time only."""
@@ -294,17 +322,23 @@ class _Loop:
         rate = (now[0] - then[0]) / max(now[1] - then[1], 1e-9)
         self._record("train", {f"{self.plan.unit.removeprefix('env_')}_per_second": rate, **columns})
 
-    def _evaluate(self) -> None:
+    def _evaluate(self, request: StopRequest) -> None:
         self._book()
         trainee, plan, progress = self.trainee, self.plan, self.progress
+        try:
+            with request.abandoning():
+                columns, scored = trainee.evaluate(seed_for(plan.seed, 9, trainee.amount))
+        except KeyboardInterrupt:  # asked twice; what has been learned is not at work here, and can be saved
+            self._book(training=False)
+            self.interrupted(request)
+            raise
         progress.next_evaluation = self._after(plan.evaluate_every)
         progress.evaluated_at = trainee.amount
-        columns, scored = trainee.evaluate(seed_for(plan.seed, 9, trainee.amount))
         if scored is not None:
             score = progress.greedy_return = scored.greedy_return
             if progress.best_return is None or score > progress.best_return:
                 progress.best_return = score
-                keep_best(self.folder.path, scored)
+                keep_best(self.folder.path, scored, self._origin())
             if plan.stop_at_return is not None and progress.reached_at is None and score >= plan.stop_at_return:
                 progress.reached_at = trainee.amount
         self._book(training=False)
@@ -312,10 +346,19 @@ class _Loop:
         if columns:
             self._record("evaluation", columns)
 
-    def _save(self) -> None:
+    def _origin(self) -> dict[str, Any]:
+        return origin.present(self.folder.config, self.folder.free)
+
+    def _save(self, request: StopRequest) -> None:
+        with request.saving():
+            self._checkpoint()
+
+    def _checkpoint(self) -> None:
         self.progress.next_checkpoint = self._after(self.plan.checkpoint_every)
         self.trainee.require_finite()
         self._book()
         state = self.trainee.state_dict()
         state["progress"] |= {name: value for name, value in asdict(self.progress).items() if value is not None}
+        state["progress"]["num_rows"] = self.folder.num_rows
+        state["origin"] = self._origin()
         checkpoint.save(self.folder.checkpoints_path, self.trainee.env_steps, state)

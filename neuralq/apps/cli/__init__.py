@@ -9,7 +9,10 @@ import difflib
 import importlib
 import itertools
 import json
+import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -193,8 +196,41 @@ def _present_folder() -> Iterator[None]:
             sys.path.remove(here)
 
 
+@contextlib.contextmanager
+def _listening() -> Iterator[list[int]]:
+    """Ctrl-C raises KeyboardInterrupt, as ever, and is remembered: raised while kernels load, it may be swallowed."""
+    heard: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not (
+        signal.default_int_handler
+    ):
+        yield heard
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield heard
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
+    """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage, 130 interrupted."""
+    with contextlib.ExitStack() as stack:
+        if sys.stderr is None:  # closed by whoever started us: what is printed there must not get into the result
+            stack.enter_context(contextlib.redirect_stderr(stack.enter_context(open(os.devnull, "w"))))
+        heard = stack.enter_context(_listening())
+        status = _main(argv)
+        if heard and status == 0:
+            print("neuralq: interrupted", file=sys.stderr)
+            return 130
+        return status
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments:
         print(_top_help(), file=sys.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
+import secrets
 import warnings
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def _write_checked(
     agent: Agent, config: RunConfig, out: Path, observations: Array, expected: Array
 ) -> tuple[float, float]:
     """Write the file if its values are those expected; how far they differ, and how far they may."""
-    partial = out.with_name(f".partial-{out.name}")
+    partial = out.with_name(f".partial-{secrets.token_hex(8)}")  # a name that nobody can foresee
     try:
         _write(agent, observations, partial, config)
         difference, bound = _difference(partial, observations, expected, agent)

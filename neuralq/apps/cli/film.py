@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from neuralq.apps.cli import Failure
 from neuralq.checks import MissingExtra
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
+from neuralq.runs.folder.files import replacing
 from neuralq.runs.loop import seed_for
 from neuralq.runs.recipe.games import make_single, refusals_name
 from neuralq.runs.stream import legal_actions
@@ -164,13 +166,12 @@ class GifWriter:
 
     def close(self) -> None:
         """Write the file, in one move."""
-        partial = self._path.with_name(f".partial-{self._path.name}")
         first, *others = self._images
-        first.save(
-            partial, format="GIF", save_all=True, append_images=others, duration=self._milliseconds, loop=0,
-            optimize=False,
-        )  # fmt: skip
-        os.replace(partial, self._path)
+        with replacing(self._path) as partial:
+            first.save(
+                partial, format="GIF", save_all=True, append_images=others, duration=self._milliseconds, loop=0,
+                optimize=False,
+            )  # fmt: skip
 
     def discard(self) -> None:
         """Leave no file."""
@@ -195,7 +196,7 @@ class Mp4Writer:
             raise MissingExtra(f"MP4 needs imageio-ffmpeg ({error}); {_INSTALL}, or use --gif") from error
         self._write_frames: Any = imageio_ffmpeg.write_frames
         self._path, self._rate = path, rate
-        self._partial = path.with_name(f".partial-{path.stem}.mp4")
+        self._partial = path.with_name(f".partial-{secrets.token_hex(8)}.mp4")  # a name that nobody can foresee
         self._film: Any = None
 
     def add(self, image: Image) -> None:

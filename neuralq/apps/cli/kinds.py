@@ -8,13 +8,12 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 from typing import Any, get_type_hints
 
 from neuralq.apps.cli import Failure, print_result
 from neuralq.apps.cli.options import add_fields, as_typed, hyphenated, read_config_file, read_options
 from neuralq.apps.cli.progress import training_bar
-from neuralq.runs.folder.run_folder import read_config, refuse_old_run
+from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
 from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named
 
 __all__ = ["conclude", "measured_by", "new_budget", "resume_kind", "say", "train_kind"]
@@ -46,23 +45,23 @@ def train_kind(name: str, argv: Sequence[str]) -> int:
     given = read_options(parser, hyphenated(argv))
     as_json, run_dir = given.pop("json", False), given.pop("run_dir", None)
     config = _config(kind, given)
-    path = Path(run_dir or kind.default_path(config))
-    refuse_old_run(path)  # also by the run, but preparing takes seconds
-    say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
-    with training_bar(kind, config) as bar:
-        run = kind.train(config, path, [bar])
+    with claimed(run_dir, lambda: kind.default_path(config)) as path:
+        refuse_old_run(path)  # also by the run, but preparing takes seconds
+        say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
+        with training_bar(kind, config) as bar:
+            run = kind.train(config, path, [bar])
     return conclude(run, as_json)
 
 
 def resume_kind(name: str, options: argparse.Namespace) -> int:
     """Go on with a run, as the options of ``neuralq resume`` say."""
     kind = kind_named(name)
-    for other in ("workers", "hook"):
-        if getattr(options, other) is not None:
-            raise Failure(f"--{other} is not for {kind.title} like {options.run}; leave it out", 2)
+    for other in ("workers", "hook", "stop_at_return", "device"):
+        if getattr(options, other, None) is not None:
+            raise Failure(f"--{other.replace('_', '-')} is not for {kind.title} like {options.run}; leave it out", 2)
     budget, config = new_budget(kind, options), kind.from_plain(read_config(options.run))
     try:
-        config = config if budget is None else kind.with_budget(config, budget)
+        config = config if budget is None else kind.changed(config, budget)
     except ValueError as error:
         raise Failure(_in_options(kind, str(error)), 2) from error
     with training_bar(kind, config) as bar:

@@ -23,6 +23,7 @@ from neuralq.lab import METHODS, PROBLEMS, Cell, Matrix, problem
 from neuralq.lab import matrix as matrix_of
 from neuralq.lab import method as method_named
 from neuralq.lab.comparison import ABSENT, NEUTRAL_BAND
+from neuralq.runs.children import safe_path
 
 __all__ = ["baird", "matrix"]
 
@@ -113,7 +114,7 @@ def _in_parallel(problems: list[str], methods: list[str], jobs: int, bar: Bar, *
     if jobs == 1 or len(problems) == 1:
         return matrix_of(problems, methods, lambda *at: bar(at), **sampled)
     rows = []
-    with ProcessPoolExecutor(min(jobs, len(problems)), mp_context=get_context("spawn")) as pool:
+    with safe_path(), ProcessPoolExecutor(min(jobs, len(problems)), mp_context=get_context("spawn")) as pool:
         waiting = [pool.submit(matrix_of, [name], methods, **sampled) for name in problems]
         for i, one in enumerate(waiting):
             rows.append(one.result())

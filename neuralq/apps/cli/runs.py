@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib
 from collections.abc import Callable, Iterator
-from datetime import datetime
 from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
@@ -18,7 +18,7 @@ from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import default_run_path, read_config, refuse_old_run
+from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
@@ -39,12 +39,12 @@ def train(argv: list[str]) -> int:
     config, options = parsed
     if options.seeds is not None:
         return train_seeds(config, options)
-    path = Path(options.run_dir or default_run_path(config.env, config.layout, config.seed, datetime.now()))
-    refuse_old_run(path)  # also by the run, but preparing takes seconds
-    origin = started_from(config, options)
-    say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
-    with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
-        run = CONTROL.train(config, path, hooks)
+    with claimed(options.run_dir, lambda: CONTROL.default_path(config)) as path:
+        refuse_old_run(path)  # also by the run, but preparing takes seconds
+        origin = started_from(config, options)
+        say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
+        with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
+            run = CONTROL.train(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
 
@@ -58,6 +58,13 @@ def resume(argv: list[str]) -> int:
     parser.add_argument("run", help="run folder, or sweep folder")
     parser.add_argument("--total-steps", type=int, metavar="N", help="a new budget; lets a finished run go on")
     parser.add_argument("--games", type=int, metavar="N", help="the same for runs that count games, as td-gammon")
+    parser.add_argument(
+        "--stop-at-return", type=target, metavar="X", default=argparse.SUPPRESS,
+        help="a new target, or none; lets a run go on that has reached the old one",
+    )  # fmt: skip
+    parser.add_argument(
+        "--device", metavar="NAME", default=argparse.SUPPRESS, help="compute elsewhere: cpu, cuda, cuda:1, …"
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="of a sweep: how many seeds at a time")
     parser.add_argument("--hook", metavar="module:name", help="of a run on an environment: as for neuralq train")
     options = parser.parse_args(argv)
@@ -65,18 +72,29 @@ def resume(argv: list[str]) -> int:
     if kind not in (None, "control"):
         return resume_kind(kind, options)
     total_steps = new_budget(CONTROL, options)
+    changes = {name: getattr(options, name) for name in ("stop_at_return", "device") if hasattr(options, name)}
     if is_sweep_folder(options.run):
         if options.hook is not None:
             raise Failure("a sweep goes on with the hook that it was begun with; leave --hook out", 2)
-        return resume_seeds(options.run, total_steps, options.workers, options.json)
+        return resume_seeds(options.run, total_steps, options.workers, options.json, changes)
     if options.workers is not None:
         raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
-    config = config_from_dict(read_config(options.run))
-    path, planned = Path(options.run), config if total_steps is None else CONTROL.with_budget(config, total_steps)
+    path = Path(options.run)
+    planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
     board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
     with _hooks(path, planned, board, tracker, options.hook) as hooks:
-        run = CONTROL.resume(path, total_steps, hooks)
-    return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
+        run = CONTROL.resume(path, total_steps, hooks, changes)
+    return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
+
+
+def target(text: str) -> float | None:
+    """A target as ``neuralq resume`` takes it: a number, or none.
+
+    Example:
+        >>> target("475"), target("none")
+        (475.0, None)
+    """
+    return None if text.lower() in ("none", "null") else float(text)
 
 
 @contextlib.contextmanager

@@ -5,17 +5,19 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import TextIO
+from types import MappingProxyType
+from typing import Any, TextIO
 
 from neuralq.apps.cli import Failure, main, print_result
 from neuralq.apps.cli.kinds import say
 from neuralq.apps.cli.options import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
-from neuralq.runs.folder.run_folder import default_run_path, is_run_folder
+from neuralq.runs.children import python_command
+from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
 from neuralq.runs.recipe.config import config_to_dict
@@ -48,15 +50,19 @@ _CHILD = "from neuralq.apps.cli.sweeps import child; child()"
 def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     """Run seeds side by side; exit status 0 only if each finished and, where a target was set, reached it."""
     assert options.seeds is not None
-    single = default_run_path(config.env, config.layout, config.seed, datetime.now())
-    path = Path(options.run_dir or single.with_name(f"sweep-{single.name}"))
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
     if options.hook is not None:
         own_hook(options.hook)  # a name that is wrong is one error, not one for each seed
         flags += ["--hook", options.hook]
     seeds = range(config.seed, config.seed + options.seeds)
-    sweep = create_sweep(path, config_to_dict(config), seeds, flags)
+    with claimed(options.run_dir, lambda: _default_path(config)) as path:
+        sweep = create_sweep(path, config_to_dict(config), seeds, flags)
     return _run(sweep, options.workers, options.json, started_from(config, options))
+
+
+def _default_path(config: RunConfig) -> Path:
+    single = default_run_path(config.env, config.layout, config.seed, datetime.now())
+    return single.with_name(f"sweep-{single.name}")
 
 
 def started_from(config: RunConfig, options: TrainOptions) -> str:
@@ -67,9 +73,15 @@ def started_from(config: RunConfig, options: TrainOptions) -> str:
     return f"{preset}; within {config.total_steps:,} steps {', '.join(options.notes)}"
 
 
-def resume_seeds(path: str | Path, total_steps: int | None, num_workers: int | None, as_json: bool) -> int:
+def resume_seeds(
+    path: str | Path,
+    total_steps: int | None,
+    num_workers: int | None,
+    as_json: bool,
+    changes: Mapping[str, Any] = MappingProxyType({}),
+) -> int:
     """Go on with a sweep: seeds that have not finished, and those that failed."""
-    return _run(open_sweep(path, total_steps), num_workers, as_json, "")
+    return _run(open_sweep(path, total_steps, changes), num_workers, as_json, "")
 
 
 def single_run(path: str) -> Path:
@@ -103,14 +115,25 @@ def child() -> None:
 
 
 def _command(sweep: Sweep, seed: int) -> list[str]:
-    begin = [sys.executable, "-c", _CHILD]
+    begin = python_command(_CHILD)
     path = str(sweep.run_path(seed))
     if is_run_folder(path):
         options = list(sweep.options)
         hook = options[(at := options.index("--hook")) : at + 2] if "--hook" in options else []
-        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *hook]
+        told = [f"--{n.replace('_', '-')}={str(value).lower()}" for n, value in _moved(sweep, path).items()]
+        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hook]
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
+
+
+def _moved(sweep: Sweep, run: str) -> dict[str, Any]:
+    """What a seed may go on with otherwise than it began, and the sweep by now has otherwise."""
+    try:
+        began = read_config(run)
+    except RunFolderError:  # its process will say so
+        return {}
+    names = [name for name in ("stop_at_return", "device") if name in sweep.config and name in began]
+    return {name: sweep.config[name] for name in names if sweep.config[name] != began[name]}
 
 
 def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import sys
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
+
+from neuralq.runs.children import python_command
 
 __all__ = ["Busy", "Left", "Pool", "TooLong"]
 
@@ -119,13 +119,11 @@ class Pool:
                 return
 
     async def _start(self) -> asyncio.subprocess.Process:
-        places = os.pathsep.join(place for place in sys.path if place)  # finds what this process finds
         worker = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-m", "neuralq.apps.web.worker"),
+            *python_command("from neuralq.apps.web.worker import main; main()"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=_LONGEST_LINE,
-            env={**os.environ, "PYTHONPATH": places},
         )
         self._all.add(worker)
         return worker

@@ -7,6 +7,7 @@ means; `neuralq evaluate RUN --best` plays fresh episodes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor
 
 from neuralq.runs.folder.checkpoint import CheckpointError, load_newest, save
+from neuralq.runs.folder.origin import compared
+from neuralq.runs.folder.run_folder import is_run_folder, read_config
 
 __all__ = ["BEST_FOLDER", "Best", "keep_best", "load_best"]
 
@@ -39,8 +42,13 @@ class Best:
     normalisation: dict[str, Any] | None = None
 
 
-def keep_best(run_dir: str | Path, best: Best) -> Path:
+def keep_best(run_dir: str | Path, best: Best, origin: Mapping[str, Any] | None = None) -> Path:
     """Keeps these parameters as the best of the run, in one step, in place of those kept before.
+
+    Args:
+        run_dir: folder of the run.
+        best: what to keep.
+        origin: what they were made by, from `neuralq.runs.folder.origin.present`.
 
     Raises:
         CheckpointError: if the disk refuses; what was kept before is intact.
@@ -53,6 +61,7 @@ def keep_best(run_dir: str | Path, best: Best) -> Path:
         31.5
     """
     state = {name: getattr(best, name) for name in ("greedy_return", "parameters", "normalisation")}
+    state["origin"] = None if origin is None else dict(origin)
     return save(Path(run_dir) / BEST_FOLDER, best.env_steps, state, keep=1)
 
 
@@ -60,13 +69,15 @@ def load_best(run_dir: str | Path) -> Best:
     """The best parameters of a run.
 
     Raises:
-        CheckpointError: if none were kept, or the file is damaged.
+        CheckpointError: if none were kept, the file is damaged, or belongs to a run of another configuration.
     """
     folder = Path(run_dir) / BEST_FOLDER
     if not folder.is_dir():
         raise CheckpointError(f"{run_dir} has kept no best parameters: it was not evaluated yet; leave out --best")
     saved = load_newest(folder)
     state = saved.state
+    if is_run_folder(run_dir):
+        compared(state.get("origin"), read_config(run_dir), saved.path)
     try:
         parameters = torch.as_tensor(state["parameters"])
         return Best(saved.step, float(state["greedy_return"]), parameters, state.get("normalisation"))

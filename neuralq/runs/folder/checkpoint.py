@@ -17,6 +17,7 @@ import json
 import math
 import os
 import re
+import secrets
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
@@ -40,7 +41,7 @@ OWN_FILE_BYTES = 1 << 20
 _MANIFEST, _STATE, _TENSORS, _ARRAYS = "manifest.json", "state.json", "tensors.safetensors", "arrays.npy"
 _FILE_NAME = re.compile(r"state\.json|tensors\.safetensors|arrays\.npy|array-[0-9]{5}\.npy")
 _FOLDER_NAME = re.compile(r"step-([0-9]{12,18})(\.replaced)?")
-_TEMPORARY_NAME = re.compile(r"\.tmp-(write|drop)-step-[0-9]{12,18}(\.replaced)?-[0-9]+")
+_TEMPORARY_NAME = re.compile(r"\.tmp-(write|drop)-step-[0-9]{12,18}(\.replaced)?-[0-9a-f]+")
 
 
 class CheckpointError(RuntimeError):
@@ -251,8 +252,25 @@ class _Unpacking:
 
 def _write(folder: Path, step: int, document: Any, packing: _Packing) -> Path:
     path = folder / f"step-{step:012d}"
-    temporary = folder / f".tmp-write-{path.name}-{os.getpid()}"
+    temporary = folder / f".tmp-write-{path.name}-{secrets.token_hex(8)}"  # a name that nobody can foresee
     temporary.mkdir()
+    try:
+        _fill(temporary, step, document, packing)
+        if os.path.lexists(path):
+            # A folder cannot be replaced in one step; the old one stays loadable under its second name meanwhile.
+            aside = folder / f"{path.name}.replaced"
+            _drop(aside)
+            os.rename(path, aside)
+        os.rename(temporary, path)
+    except Exception:
+        shutil.rmtree(temporary, ignore_errors=True)  # on a full disk it would keep the room that is missing
+        raise
+    _sync(folder)
+    _drop(folder / f"{path.name}.replaced")
+    return path
+
+
+def _fill(temporary: Path, step: int, document: Any, packing: _Packing) -> None:
     if packing.tensors:
         save_file(packing.tensors, temporary / _TENSORS)
         _sync(temporary / _TENSORS)
@@ -276,15 +294,6 @@ def _write(folder: Path, step: int, document: Any, packing: _Packing) -> Path:
         }
         file.write(_signed(body))
     _sync(temporary)
-    if path.exists():
-        # A folder cannot be replaced in one step; the old one stays loadable under its second name meanwhile.
-        aside = folder / f"{path.name}.replaced"
-        _drop(aside)
-        os.rename(path, aside)
-    os.rename(temporary, path)
-    _sync(folder)
-    _drop(folder / f"{path.name}.replaced")
-    return path
 
 
 @contextlib.contextmanager
@@ -392,7 +401,9 @@ def _prune(folder: Path, newest: Path, keep: int) -> None:
 
 def _drop(path: Path) -> None:
     """Renamed before it is deleted, so that a half-deleted checkpoint never looks like a damaged one."""
-    if path.exists():
-        doomed = path.parent / f".tmp-drop-{path.name}-{os.getpid()}"
+    if path.is_symlink():  # never what it leads to
+        path.unlink()
+    elif path.exists():
+        doomed = path.parent / f".tmp-drop-{path.name}-{secrets.token_hex(8)}"
         os.rename(path, doomed)
         shutil.rmtree(doomed)

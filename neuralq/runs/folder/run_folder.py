@@ -2,6 +2,7 @@
 
     config.json     the effective configuration       run.json       seed and format; written last, so it marks a run
     versions.json   of Python and the libraries       metrics.jsonl  one JSON object per line, flushed
+                                                      (each with a checksum, ``crc32``)
     summary.json    the final result                  checkpoints/   see `neuralq.runs.folder.checkpoint`
     run.lock        held by the one writer            report.html    see `neuralq.runs.report`
 
@@ -11,12 +12,14 @@ dies. Reading needs no lock: whole files are replaced in one step, and a half-wr
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
-import json
+import itertools
 import os
 import platform
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -27,9 +30,15 @@ from neuralq.runs.folder.files import (
     FolderLock,
     RunFolderBusy,
     RunFolderError,
+    append_line,
+    clear_left_overs,
+    open_regular,
     plain_values,
     read_json,
+    read_regular,
     read_rows,
+    refuse_links,
+    row_line,
     to_json,
     write_durably,
 )
@@ -38,6 +47,7 @@ __all__ = [
     "RunFolder",
     "RunFolderBusy",
     "RunFolderError",
+    "claimed",
     "default_run_path",
     "is_run_folder",
     "library_versions",
@@ -46,10 +56,13 @@ __all__ = [
     "read_seed",
     "read_summary",
     "refuse_old_run",
+    "warn_of_lost_rows",
 ]
 
 FORMAT_NAME = "neuralq-run"
 FORMAT_VERSION = 1
+_FILES = ("config.json", "versions.json", "run.json", "metrics.jsonl", "summary.json")
+_FOLDERS = ("checkpoints", "best", "tensorboard", "wandb")
 _LIBRARIES = ("torch", "numpy", "scipy", "gymnasium", "numba", "safetensors")
 
 
@@ -70,7 +83,12 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.config: dict[str, Any] = {}
+        """The effective configuration, as ``config.json`` has it."""
+        self.free: frozenset[str] = frozenset()
+        """Names of the configuration that do not decide what is learned: checkpoints do not depend on them."""
         self._lock = FolderLock(path / "run.lock", f"{path} is being written")
+        self._num_rows: int | None = None
 
     @classmethod
     def create(cls, path: str | Path, *, config: Mapping[str, Any], seed: int) -> RunFolder:
@@ -89,10 +107,12 @@ class RunFolder:
         run = cls(path)
         try:
             refuse_old_run(path)
+            run._clear()
+            run.config = dict(config)
             write_durably(path / "config.json", document)
-            write_durably(path / "versions.json", to_json(library_versions(), "versions"))
+            write_durably(path / "versions.json", to_json(library_versions(), "versions", sealed=True))
             marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seed": int(seed)}
-            write_durably(path / "run.json", to_json(marker, "run"))
+            write_durably(path / "run.json", to_json(marker, "run", sealed=True))
         except BaseException:
             run.close()
             raise
@@ -110,6 +130,8 @@ class RunFolder:
         _read_marker(path)
         run = cls(path)
         try:
+            run._clear()
+            run.config = read_json(path / "config.json")
             _cut_torn_line(run.metrics_path)
         except BaseException:
             run.close()
@@ -126,6 +148,14 @@ class RunFolder:
         """One JSON object per line."""
         return self.path / "metrics.jsonl"
 
+    @property
+    def num_rows(self) -> int:
+        """Lines of ``metrics.jsonl``."""
+        if self._num_rows is None:
+            there = os.path.lexists(self.metrics_path)
+            self._num_rows = read_regular(self.metrics_path).count(b"\n") if there else 0
+        return self._num_rows
+
     def append_metrics(self, row: Mapping[str, float | int | str | None]) -> None:
         """One line more in ``metrics.jsonl``, out of this process's hands when the call returns.
 
@@ -140,9 +170,10 @@ class RunFolder:
         if "env_steps" not in row:
             raise ValueError(f"a row of metrics must hold env_steps, got only {sorted(row)}")
         check_whole("env_steps", row["env_steps"], 0)  # type: ignore[arg-type]  # it checks what it is given
-        line = json.dumps({name: plain_values(value, name) for name, value in row.items()}, allow_nan=False)
-        with open(self.metrics_path, "a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        line = row_line({name: plain_values(value, name) for name, value in row.items()})
+        num_rows = self.num_rows
+        append_line(self.metrics_path, line)
+        self._num_rows = num_rows + 1
 
     def truncate_metrics(self, after_env_steps: int) -> int:
         """Drops the rows beyond ``after_env_steps``: those that the resumed run will write again.
@@ -154,25 +185,31 @@ class RunFolder:
             RunFolderError: if a line other than the last is damaged.
         """
         self._check_open()
-        rows = read_metrics(self.path)
+        rows = read_rows(self.metrics_path)
         kept = [row for row in rows if row["env_steps"] <= after_env_steps]
         if len(kept) < len(rows):
-            write_durably(self.metrics_path, "".join(json.dumps(row) + "\n" for row in kept))
+            write_durably(self.metrics_path, "".join(row_line(row) + "\n" for row in kept))
+        self._num_rows = len(kept)
         return len(rows) - len(kept)
 
     def replace_config(self, config: Mapping[str, Any]) -> None:
         """The effective configuration from now on (a resumed run may have a new budget), replaced in one step."""
         self._check_open()
         write_durably(self.path / "config.json", to_json(config, "config"))
+        self.config = dict(config)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """The final result, replaced in one step; NaN and infinities become null.
+
+        With it goes how many rows of metrics there are, so that rows that are lost later are missed.
 
         Raises:
             TypeError: for a value that JSON cannot express.
         """
         self._check_open()
-        write_durably(self.path / "summary.json", to_json(plain_values(summary, "summary"), "summary"))
+        values = {**summary, "num_rows": self.num_rows}
+        document = to_json(plain_values(values, "summary"), "summary", sealed=True)
+        write_durably(self.path / "summary.json", document)
 
     def close(self) -> None:
         """Gives the lock back; closing twice is fine."""
@@ -183,6 +220,11 @@ class RunFolder:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
+
+    def _clear(self) -> None:
+        """Nothing is written through a link out of the folder, and what a killed writer left is gone."""
+        refuse_links(self.path, _FOLDERS)
+        clear_left_overs(self.path, _FILES)
 
     def _check_open(self) -> None:
         if not self._lock.is_held:
@@ -198,6 +240,38 @@ def default_run_path(env_id: str, layout: str, seed: int, timestamp: datetime, r
     """
     slug = re.sub(r"[^A-Za-z0-9._]+", "-", f"{env_id}-{layout}")[:120].strip(".-") or "run"
     return Path(root) / f"{slug}-s{int(seed)}-{timestamp:%Y%m%d-%H%M%S}"
+
+
+@contextlib.contextmanager
+def claimed(run_dir: str | Path | None, default: Callable[[], Path]) -> Iterator[Path]:
+    """The folder for a run: the one that is named, or one that is made here and that nobody else is given.
+
+    Two runs that begin within one second have one default path; the later one gets a number behind it. Where the block
+    fails before anything is in it, the folder is removed.
+
+    Example:
+        >>> import tempfile
+        >>> root = Path(tempfile.mkdtemp())
+        >>> with claimed(None, lambda: root / "run"), claimed(None, lambda: root / "run") as path:
+        ...     path.name
+        'run-2'
+    """
+    if run_dir is not None:
+        yield Path(run_dir)
+        return
+    first = path = default()
+    for number in itertools.count(2):
+        try:
+            path.mkdir(parents=True)
+            break
+        except FileExistsError:
+            path = first.with_name(f"{first.name}-{number}")
+    try:
+        yield path
+    except BaseException:
+        with contextlib.suppress(OSError):  # something is in it
+            path.rmdir()
+        raise
 
 
 def library_versions() -> dict[str, str]:
@@ -252,19 +326,36 @@ def read_summary(path: str | Path) -> dict[str, Any]:
     file = Path(path) / "summary.json"
     if not file.exists():
         raise RunFolderError(f"the run in {path} has no summary yet: finish it with `neuralq resume {path}`")
-    return read_json(file)
+    summary = read_json(file)
+    summary.pop("num_rows", None)
+    return summary
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
     """The rows of ``metrics.jsonl`` in the order written, also while the run is being written.
 
-    A last line without its end is passed over: its writer was killed, or is at it now.
+    A last line without its end is passed over: its writer was killed, or is at it now. Where rows are missing that the
+    summary has counted, a warning says so.
 
     Raises:
         RunFolderError: if there is no run in ``path``, or a line other than the last is damaged.
     """
-    _read_marker(Path(path))
-    return read_rows(Path(path) / "metrics.jsonl")
+    path = Path(path)
+    _read_marker(path)
+    rows, summary = read_rows(path / "metrics.jsonl"), path / "summary.json"
+    with contextlib.suppress(RunFolderError):  # whoever needs the summary says what is wrong with it
+        warn_of_lost_rows(path, len(rows), read_json(summary).get("num_rows") if summary.is_file() else None)
+    return rows
+
+
+def warn_of_lost_rows(path: Path, num_rows: int, counted: Any) -> None:
+    """A warning where ``metrics.jsonl`` holds fewer rows than there were."""
+    if isinstance(counted, int) and num_rows < counted:
+        warnings.warn(
+            f"{path / 'metrics.jsonl'} has lost rows: it held {counted:,}, and {num_rows:,} are left; what is drawn "
+            "or compared from it is incomplete",
+            stacklevel=3,
+        )
 
 
 def _read_marker(path: Path) -> dict[str, Any]:
@@ -285,7 +376,7 @@ def _read_marker(path: Path) -> dict[str, Any]:
 def refuse_old_run(path: Path) -> None:
     """Raises `RunFolderError` if there is a run in ``path``, whole or in part."""
     for name in ("run.json", "metrics.jsonl", "checkpoints", "summary.json"):
-        if (path / name).exists():
+        if os.path.lexists(path / name):  # also a link that leads nowhere
             raise RunFolderError(
                 f"{path} already holds a run ({name}); continue it with `neuralq resume {path}`, "
                 "or choose another folder with --run-dir"
@@ -294,8 +385,12 @@ def refuse_old_run(path: Path) -> None:
 
 def _cut_torn_line(path: Path) -> None:
     """So that the next row does not continue the line that a killed writer left."""
-    if path.exists():
-        content = path.read_bytes()
+    if os.path.lexists(path):
+        content = read_regular(path)
         whole = content.rfind(b"\n") + 1
         if whole < len(content):
-            os.truncate(path, whole)
+            descriptor = open_regular(path, os.O_WRONLY)
+            try:
+                os.ftruncate(descriptor, whole)
+            finally:
+                os.close(descriptor)

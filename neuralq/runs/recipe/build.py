@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import copy
 import importlib
+import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
@@ -63,13 +66,48 @@ def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> Vecto
         if module:  # registers the environment
             importlib.import_module(module)
         spec = gym.spec(env_id)
-        twin = vector_twin(spec, config.env_kwargs)
+        limit = config.env_kwargs.get("max_episode_steps")
+        twin = vector_twin(spec, config.env_kwargs) if limit in (None, -1) or _is_limit(limit) else None
         if twin is not None:
             return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
-        if num_envs > 1 and spec.vector_entry_point is not None and not env_id.startswith(ATARI):
-            return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **config.env_kwargs)
+        if (num_envs > 1 or spec.entry_point is None) and not env_id.startswith(ATARI):
+            vectorised = _own_vectorised(spec, config.env_kwargs, num_envs)
+            if vectorised is not None:
+                return vectorised
         clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
         return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
+
+
+def _is_limit(limit: Any) -> bool:
+    return isinstance(limit, int) and not isinstance(limit, bool) and limit > 0
+
+
+def _own_vectorised(spec: EnvSpec, env_kwargs: Mapping[str, Any], num_envs: int) -> VectorEnv[Any, Any, Any] | None:
+    """The environment's own vectorised implementation, where it means what `gymnasium.make` makes of these arguments.
+
+    It does not where there are wrappers, where episodes shall have no limit, which such a class takes for a limit of
+    −1, where it knows less arguments than the single environment, or does not say how it restarts episodes.
+    """
+    given = {name: value for name, value in env_kwargs.items() if name != "disable_env_checker"}
+    limit = given.get("max_episode_steps")
+    if limit is None:
+        given.pop("max_episode_steps", None)
+    elif not _is_limit(limit):
+        return None
+    if spec.vector_entry_point is None or spec.additional_wrappers:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore" if spec.entry_point is not None else "default")
+        try:
+            envs = gym.make_vec(spec.id, num_envs=num_envs, vectorization_mode="vector_entry_point", **given)
+        except TypeError:
+            if spec.entry_point is None:
+                raise
+            return None
+    if spec.entry_point is None or isinstance((envs.metadata or {}).get("autoreset_mode"), AutoresetMode):
+        return envs
+    envs.close()
+    return None
 
 
 def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:
@@ -186,9 +224,11 @@ def _check_device(device: str) -> None:
         usable = torch.zeros(1, device=device).add(1).item() == 1  # a device may be known and still not there
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).strip().split("\n")[0]
-        raise ValueError(f"cannot compute on device {device!r}: {reason}; device='cpu' always works") from error
+        raise ValueError(
+            f"cannot compute on device {device!r}: {reason}; device='cpu' always works (--device cpu)"
+        ) from error
     if not usable:
-        raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works")
+        raise ValueError(f"device {device!r} computes wrongly; device='cpu' always works (--device cpu)")
 
 
 def _q_on_device(config: RunConfig, spec: ObservationSpec, purpose: int) -> QFunction:

@@ -108,7 +108,7 @@ def make_single(
     kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
     if env.startswith(MINATAR) and kwargs.get("render_mode") == "rgb_array":
         # Its pictures are floats of 10 × 10, at which the checker would take offence at every one.
-        return _Enlarged(gym.make(env, disable_env_checker=True, **kwargs))
+        return _Enlarged(gym.make(env, **{**kwargs, "disable_env_checker": True}))
     if not is_screen(env, env_kwargs):
         return gym.make(env, **kwargs)
     frame_skip = kwargs.pop("frameskip", _FRAME_SKIP)

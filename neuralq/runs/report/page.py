@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from neuralq.runs.folder.files import write_durably
 
 __all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table"]
 
@@ -105,9 +106,7 @@ class Page:
     def write(self, path: Path) -> Path:
         """Writes the document in one move: a reader sees the old page or the new one, never half of one."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.partial")
-        partial.write_text(self.html(), encoding="utf-8", errors="replace", newline="\n")
-        os.replace(partial, path)
+        write_durably(path, self.html())
         return path
 
 

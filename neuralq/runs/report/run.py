@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.runs.folder.files import read_json, read_rows
+from neuralq.runs.folder.run_folder import warn_of_lost_rows
 from neuralq.runs.report.curves import SIGNALS, learning_curve_svg, signals_svg
 from neuralq.runs.report.page import Page, facts_table, flatten
 from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite
@@ -42,6 +43,7 @@ def write_report(run_dir: str | Path) -> Path:
     rows = read_rows(folder / "metrics.jsonl")
     files = (folder / f"{name}.json" for name in ("config", "versions", "summary"))
     config, versions, summary = (read_json(file) if file.exists() else {} for file in files)
+    warn_of_lost_rows(folder, len(rows), summary.pop("num_rows", None))
     target = _first_number(config, _TARGET_KEYS)
     page = Page(_title(config, folder), lead=_lead(rows, target))
     page.heading("Result")

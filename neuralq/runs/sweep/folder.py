@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from neuralq.checks import check_whole
@@ -91,8 +92,10 @@ def create_sweep(
     return Sweep(path, dict(config), tuple(seeds), tuple(options))
 
 
-def open_sweep(path: str | Path, total_steps: int | None = None) -> Sweep:
-    """The sweep in ``path``, with a new budget for every seed if ``total_steps`` is given.
+def open_sweep(
+    path: str | Path, total_steps: int | None = None, changes: Mapping[str, Any] = MappingProxyType({})
+) -> Sweep:
+    """The sweep in ``path``, with a new budget for every seed if ``total_steps`` is given, and other changes.
 
     Raises:
         RunFolderError: if there is none, or its files are damaged.
@@ -109,7 +112,9 @@ def open_sweep(path: str | Path, total_steps: int | None = None) -> Sweep:
         raise RunFolderError(f"the sweep in {path} cannot be read: {error}") from error
     if total_steps is not None:
         check_whole("total_steps", total_steps)
-        sweep.config["total_steps"] = total_steps
+        changes = {**changes, "total_steps": total_steps}
+    if changes:
+        sweep.config.update(changes)
         write_durably(path / "config.json", to_json(sweep.config, "config"))
     return sweep
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import FolderLock, to_json, write_durably
+from neuralq.runs.folder.files import (
+    FolderLock,
+    RunFolderError,
+    open_regular,
+    refuse_links,
+    to_json,
+    write_durably,
+)
 from neuralq.runs.folder.run_folder import read_summary
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.sweep.folder import Sweep, has_finished, steps_so_far
@@ -152,7 +158,7 @@ def run_sweep(
         finally:
             processes.kill()
         result = SweepResult(tuple(processes.result(seed) for seed in sweep.seeds), request.name)
-        write_durably(sweep.path / "summary.json", to_json(result.plain(), "summary"))
+        write_durably(sweep.path / "summary.json", to_json(result.plain(), "summary", sealed=True))
     return result
 
 
@@ -168,14 +174,16 @@ class _Processes:
 
     def start(self, seed: int) -> None:
         try:
-            with open(self.sweep.log_path(seed), "wb") as log:
+            refuse_links(self.sweep.path, [self.sweep.run_path(seed).name])
+            with open(open_regular(self.sweep.log_path(seed), os.O_WRONLY | os.O_CREAT), "wb") as log:
+                log.truncate()
                 # A session of its own: the terminal's Ctrl-C reaches the parent alone, which passes it on in order.
                 self.running[seed] = subprocess.Popen(
                     list(self.command(self.sweep, seed)),
                     stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT,
                     env=_environment(int(self.sweep.config.get("threads", 1))), start_new_session=True,
                 )  # fmt: skip
-        except OSError as error:  # no memory for a process, no room for a log: this seed's fault alone
+        except (OSError, RunFolderError) as error:  # no memory for a process, no room for a log: this seed's alone
             self.reasons[seed] = str(error)
 
     def collect(self) -> None:
@@ -241,17 +249,17 @@ def stop_with_parent() -> None:
 
 
 def _environment(num_threads: int) -> dict[str, str]:
-    """The parent's, with its module path and a bound on threads, which libraries read when they are loaded."""
+    """The parent's, with a bound on threads, which libraries read when they are loaded."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     limits = dict.fromkeys(names, str(num_threads))
-    return {**os.environ, **limits, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
+    return {**os.environ, **limits}
 
 
 def _reason(log: Path, status: int) -> str:
     """Why a process failed, in one line: the last that it printed, or the signal that killed it."""
     if status < 0:
         return f"killed by {signal.Signals(-status).name}"
-    with open(log, "rb") as file:
+    with open(open_regular(log, os.O_RDONLY), "rb") as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
         lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     said = lines[-1].strip().removeprefix("neuralq: ").removeprefix("error: ") if lines else ""

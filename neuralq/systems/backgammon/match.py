@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.jit import kernel
+from neuralq.runs.children import safe_path
 from neuralq.systems.backgammon.agent import BackgammonAgent
 from neuralq.systems.backgammon.kernels import Scratch, choose
 from neuralq.systems.backgammon.network import ValueNetwork
@@ -222,8 +223,11 @@ def _blocks(
     pool: Executor = (
         ThreadPoolExecutor(workers) if compiled else ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     )
-    with pool:
-        yield from zip(starts, pool.map(_play_block, tasks), strict=True)
+    with safe_path(), pool:
+        try:
+            yield from zip(starts, pool.map(_play_block, tasks), strict=True)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # whoever leaves early waits for no more than has begun
 
 
 def _play_block(task: tuple[_Sides, range, int, bool]) -> NDArray[np.int64]:

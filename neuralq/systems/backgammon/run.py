@@ -20,10 +20,12 @@ import numpy as np
 
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import Best
+from neuralq.runs.folder.files import replacing
+from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, RunFolderError, default_run_path, read_config
 from neuralq.runs.kinds import CommandLine, Kind, kind_in
 from neuralq.runs.loop import Diverged, Hook, Plan, Progress
-from neuralq.runs.stop_request import StopRequest
+from neuralq.runs.stop_request import StopRequest, pass_on, raise_if_asked
 from neuralq.systems.backgammon.agent import BackgammonAgent
 from neuralq.systems.backgammon.config import KIND, TdGammonConfig, config_from_dict, config_to_dict
 from neuralq.systems.backgammon.match import play_match
@@ -124,7 +126,10 @@ class _Trainee:
         row: dict[str, Any] = {}
         for opponent in self.config.evaluate_against:
             workers = self.config.settings.num_threads if opponent == "random" else 1  # more would have to be processes
-            result = play_match(self.learner.network, opponent, self.config.evaluation_games, seed, workers=workers)
+            result = play_match(
+                self.learner.network, opponent, self.config.evaluation_games, seed, workers=workers,
+                progress=lambda *_: raise_if_asked(),
+            )  # fmt: skip
             self.points[opponent] = (result.points_per_game, result.standard_error)
             row[f"ppg_{opponent}"], row[f"ppg_{opponent}_standard_error"] = self.points[opponent]
             row[f"win_rate_{opponent}"], row[f"gammon_rate_{opponent}"] = result.win_rate, result.gammon_rate
@@ -162,9 +167,8 @@ def _default_path(config: TdGammonConfig) -> Path:
 def _result(config: TdGammonConfig, trainee: _Trainee, progress: Progress, folder: RunFolder) -> GammonRun:
     network = trainee.learner.network
     notes = {"games": str(trainee.amount), "seed": str(config.seed), "mode": config.settings.mode}
-    partial = folder.path / f".partial-{WEIGHTS_NAME}"
-    network.save(partial, notes)
-    partial.replace(folder.path / WEIGHTS_NAME)
+    with replacing(folder.path / WEIGHTS_NAME) as temporary:
+        network.save(temporary, notes)
     return GammonRun(
         run_dir=folder.path,
         games=trainee.amount,
@@ -197,7 +201,9 @@ def load_agent(path: str | Path | None = None) -> BackgammonAgent:
     if not any((path / "checkpoints").glob("step-*")) and (path / WEIGHTS_NAME).is_file():
         return BackgammonAgent(ValueNetwork.load(path / WEIGHTS_NAME))  # of a run whose checkpoints were deleted
     learner = SelfPlay(config_from_dict(read_config(path)).settings, 0)
-    learner.load_state_dict(checkpoint.load_newest(path / "checkpoints").state["learner"])
+    saved = checkpoint.load_newest(path / "checkpoints")
+    compared(saved.state.get("origin"), read_config(path), saved.path)
+    learner.load_state_dict(saved.state["learner"])
     return BackgammonAgent(learner.network)
 
 
@@ -229,6 +235,7 @@ TD_GAMMON = Kind(
     result=_result,
     load=_load,
     notes=_notes,
+    changeable=frozenset(("evaluate_every", "evaluation_games", "evaluate_against", "checkpoint_every", "log_every")),
     command=CommandLine(
         "Learn backgammon from games against oneself by TD(λ): Tesauro's 198 inputs, one hidden layer.",
         (
@@ -265,6 +272,7 @@ def train_games(config: TdGammonConfig, run_dir: str | Path | None = None, hooks
         RunFolderError: if the folder already holds a run.
         MissingExtra: if pubeval or gnubg shall be played and gnubg-nn is not installed.
         Diverged: if the weights stop being finite.
+        KeyboardInterrupt: at Ctrl-C, once the run is saved; another signal has its effect then, too.
 
     Example:
         >>> import tempfile
@@ -273,7 +281,7 @@ def train_games(config: TdGammonConfig, run_dir: str | Path | None = None, hooks
         >>> train_games(config, tempfile.mkdtemp() + "/run").games
         3
     """
-    return TD_GAMMON.train(config, run_dir, hooks)
+    return _passed_on(TD_GAMMON.train(config, run_dir, hooks))
 
 
 def resume_games(run_dir: str | Path, num_games: int | None = None, hooks: Sequence[Hook] = ()) -> GammonRun:
@@ -282,4 +290,9 @@ def resume_games(run_dir: str | Path, num_games: int | None = None, hooks: Seque
     Raises:
         ValueError: the run is of another kind.
     """
-    return TD_GAMMON.resume(run_dir, num_games, hooks)
+    return _passed_on(TD_GAMMON.resume(run_dir, num_games, hooks))
+
+
+def _passed_on(run: GammonRun) -> GammonRun:
+    pass_on(run.interrupted_by, f"the run was saved at {run.games:,} games; go on with: neuralq resume {run.run_dir}")
+    return run

@@ -1,0 +1,270 @@
+"""Run folders that somebody else made or a disk has changed: nothing elsewhere is touched, no wrong value believed.
+
+Mutants that must die here: a link followed when writing, a hard link emptied, a pipe waited for, a temporary name that
+can be foreseen, a changed digit shown, a lost row not missed, nesting without a bound.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from neuralq.runs import RunConfig, resume, train
+from neuralq.runs.folder import checkpoint
+from neuralq.runs.folder.files import FolderLock, RunFolderError, read_json, read_rows, replacing, row_line
+from neuralq.runs.folder.run_folder import RunFolder, read_config, read_metrics, read_seed, read_summary
+from neuralq.runs.hooks import WeightsAndBiases
+from neuralq.runs.report.page import Page
+from neuralq.runs.sweep import create_sweep, run_sweep
+
+PRECIOUS = "what must not be touched\n"
+
+
+@pytest.fixture
+def precious(tmp_path: Path) -> Path:
+    path = tmp_path / "elsewhere" / "precious"
+    path.parent.mkdir()
+    path.write_text(PRECIOUS)
+    return path
+
+
+def a_run(path: Path, num_rows: int = 3) -> Path:
+    with RunFolder.create(path, config={"env": "CartPole-v1"}, seed=3) as folder:
+        for step in range(num_rows):
+            folder.append_metrics({"kind": "evaluation", "env_steps": 100 * step, "greedy_return": 17.25 + step})
+        folder.write_summary({"env_steps": 300, "greedy_return": 19.25})
+    return path
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = RunConfig(total_steps=64, evaluate_every=64, evaluation_episodes=1, log_every=32, seed=5)
+    return train(config, tmp_path_factory.mktemp("short") / "run").run_dir
+
+
+def placed(kind: str, at: Path, target: Path) -> None:
+    at.unlink(missing_ok=True)
+    (os.symlink if kind == "symbolic" else os.link)(target, at)
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+def test_a_link_in_place_of_the_lock_leaves_what_it_leads_to_whole(kind: str, tmp_path: Path, precious: Path) -> None:
+    path = a_run(tmp_path / "run")
+    placed(kind, path / "run.lock", precious)
+    with pytest.raises(RunFolderError, match=r"run\.lock is a (link|second name)"):
+        RunFolder.open(path)
+    placed(kind, tmp_path / "sweep.lock", precious)
+    with pytest.raises(RunFolderError, match=r"sweep\.lock is a (link|second name)"):
+        FolderLock(tmp_path / "sweep.lock", "busy")
+    assert precious.read_text() == PRECIOUS
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+def test_no_row_is_appended_and_no_line_cut_through_a_link(kind: str, tmp_path: Path, precious: Path) -> None:
+    path = a_run(tmp_path / "run")
+    precious.write_text(torn := '{"env_steps": 1}\nhalf a line')
+    with RunFolder.open(path) as folder:
+        placed(kind, path / "metrics.jsonl", precious)
+        with pytest.raises(RunFolderError, match=r"metrics\.jsonl is a"):
+            folder.append_metrics({"env_steps": 7})
+    with pytest.raises(RunFolderError, match=r"metrics\.jsonl is a"):
+        RunFolder.open(path)
+    assert precious.read_text() == torn
+
+
+def test_replaced_files_go_through_no_link_and_their_temporary_names_cannot_be_foreseen(
+    tmp_path: Path, precious: Path
+) -> None:
+    path = a_run(tmp_path / "run")
+    for name in (".config.json.tmp", ".summary.json.tmp", ".report.html.partial", ".partial-weights.safetensors"):
+        os.symlink(precious, path / name)
+    for name in ("config.json", "summary.json", "report.html"):
+        placed("symbolic", path / name, precious)
+    with RunFolder.open(path) as folder:
+        folder.replace_config({"env": "other"})
+        folder.write_summary({"env_steps": 1})
+    Page("a title").write(path / "report.html")
+    assert precious.read_text() == PRECIOUS
+    assert read_config(path) == {"env": "other"} and read_summary(path) == {"env_steps": 1}
+    names = set()
+    for _ in range(2):
+        with replacing(path / "page") as temporary:
+            names.add(temporary.name)
+    assert len(names) == 2  # drawn anew each time
+
+
+def test_a_failed_replacement_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "page").write_text("old")
+    with pytest.raises(OSError, match="full"), replacing(tmp_path / "page") as temporary:
+        temporary.write_text("half")
+        raise OSError("the disk is full")
+    assert (tmp_path / "page").read_text() == "old" and os.listdir(tmp_path) == ["page"]
+
+
+def test_checkpoints_are_neither_written_nor_deleted_behind_a_link(tmp_path: Path, short: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    shutil.copytree(short, run)
+    shutil.move(run / "checkpoints", elsewhere)
+    os.symlink(elsewhere, run / "checkpoints")
+    before = sorted(p.name for p in elsewhere.iterdir())
+    with pytest.raises(RunFolderError, match="checkpoints is a link"):
+        resume(run, total_steps=128)
+    assert sorted(p.name for p in elsewhere.iterdir()) == before
+
+
+def test_a_checkpoint_that_is_a_link_is_let_go_of_and_what_it_leads_to_stays(tmp_path: Path) -> None:
+    state = {"x": torch.ones(2)}
+    theirs = checkpoint.save(tmp_path / "theirs", 1, state)
+    ours = tmp_path / "ours"
+    ours.mkdir()
+    os.symlink(theirs, ours / theirs.name)
+    for step in (2, 3, 4):
+        checkpoint.save(ours, step, state)
+    assert checkpoint.load(theirs).step == 1 and not (ours / theirs.name).is_symlink()
+
+
+def test_the_log_and_the_folder_of_a_seed_are_no_links(tmp_path: Path, precious: Path) -> None:
+    sweep = create_sweep(tmp_path / "sweep", {"env": "CartPole-v1", "total_steps": 10}, [0, 1])
+    os.symlink(precious, sweep.log_path(0))
+    os.symlink(precious.parent, sweep.run_path(1))
+    result = run_sweep(sweep, lambda sweep, seed: ["/bin/false"], 1)
+    assert [run.state for run in result.runs] == ["failed", "failed"]
+    assert "seed-0.log is a link" in result.runs[0].reason and "seed-1 is a link" in result.runs[1].reason
+    assert precious.read_text() == PRECIOUS and os.listdir(precious.parent) == ["precious"]
+
+
+def test_the_record_of_weights_and_biases_is_begun_behind_no_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+    import types
+
+    def refused(**_: object) -> None:
+        raise RuntimeError("no login")
+
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=refused))
+    (tmp_path / "wandb").mkdir()
+    os.symlink(tmp_path / "planted", tmp_path / "wandb" / "neuralq-run-id")  # leads nowhere yet
+    with pytest.raises(ValueError, match="cannot keep a record"):
+        WeightsAndBiases(tmp_path, {})
+    assert not (tmp_path / "planted").exists()
+
+
+@pytest.mark.parametrize("name", ["config.json", "metrics.jsonl", "summary.json", "run.lock"])
+def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(name: str, tmp_path: Path) -> None:
+    path = a_run(tmp_path / "run")
+    (path / name).unlink()
+    os.mkfifo(path / name)
+    read: dict[str, Any] = {"config.json": read_config, "metrics.jsonl": read_metrics, "summary.json": read_summary}
+    with pytest.raises(RunFolderError, match=f"{name} is a pipe"):
+        read.get(name, RunFolder.open)(path)
+
+
+def test_every_changed_bit_of_rows_and_summary_is_noticed(tmp_path: Path) -> None:
+    path = a_run(tmp_path / "run")
+    rows, summary, seed = read_metrics(path), read_summary(path), read_seed(path)
+    rng = random.Random(0)
+    files: tuple[tuple[str, Any, Any], ...] = (
+        ("metrics.jsonl", read_metrics, rows), ("summary.json", read_summary, summary), ("run.json", read_seed, seed),
+    )  # fmt: skip
+    for name, read, right in files:
+        written = (path / name).read_bytes()
+        for at in rng.sample(range(8 * len(written)), 250):
+            changed = bytearray(written)
+            changed[at // 8] ^= 1 << at % 8
+            (path / name).write_bytes(changed)
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                try:
+                    found: Any = read(path)
+                except RunFolderError:
+                    continue
+            if name == "metrics.jsonl":  # the end of a line that looks torn is passed over, and missed
+                found = [{k: v for k, v in row.items() if k in rows[0]} for row in found]
+                assert found == right or (found == right[: len(found)] and "has lost rows" in str(said[0].message))
+            elif name == "summary.json":
+                assert {k: v for k, v in found.items() if k in summary} == summary
+            else:
+                assert found == seed
+        (path / name).write_bytes(written)
+
+
+def test_rows_of_the_former_format_are_read_and_a_missing_checksum_after_others_is_damage(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.jsonl"
+    old, new = '{"env_steps": 1}\n', row_line({"env_steps": 2}) + "\n"
+    file.write_text(old + new)
+    assert read_rows(file) == [{"env_steps": 1}, {"env_steps": 2}]
+    file.write_text(new + old)
+    with pytest.raises(RunFolderError, match=r"line 2, is no row of metrics .its checksum is missing"):
+        read_rows(file)
+
+
+def test_lost_rows_are_missed_by_whoever_reads_and_by_the_run_that_goes_on(tmp_path: Path, short: Path) -> None:
+    path = a_run(tmp_path / "run")
+    (path / "metrics.jsonl").write_text("")
+    with pytest.warns(UserWarning, match="has lost rows: it held 3, and 0 are left"):
+        assert read_metrics(path) == []
+    copy = tmp_path / "copy"
+    shutil.copytree(short, copy)
+    (copy / "metrics.jsonl").write_text("")
+    (copy / "summary.json").unlink()
+    with pytest.warns(UserWarning, match="has lost rows"):
+        resume(copy, total_steps=96)
+
+
+@pytest.mark.parametrize("name", ["config.json", "run.json", "summary.json", "metrics.jsonl"])
+@pytest.mark.parametrize("depth", [100, 100_000])
+def test_deeply_nested_json_is_damage_in_any_file(name: str, depth: int, tmp_path: Path) -> None:
+    path = a_run(tmp_path / "run")
+    nested = '{"env_steps": 0, "a": ' + "[" * depth + "]" * depth + "}\n"
+    (path / name).write_text(nested + nested if name == "metrics.jsonl" else nested)
+    read: dict[str, Any] = {"config.json": read_config, "run.json": read_seed, "summary.json": read_summary}
+    with pytest.raises(RunFolderError, match="nested deeper than 64 levels"):
+        read.get(name, read_metrics)(path)
+
+
+def test_a_full_disk_leaves_neither_half_a_row_nor_a_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = a_run(tmp_path / "run")
+    before = (path / "metrics.jsonl").read_bytes()
+    write = os.write
+
+    def full(descriptor: int, data: bytes) -> int:
+        if len(data) < 20:
+            raise OSError(28, "No space left on device")
+        return write(descriptor, bytes(data[: len(data) // 2]))
+
+    with RunFolder.open(path) as folder, monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        with pytest.raises(OSError, match="No space left"):
+            folder.append_metrics({"env_steps": 400})
+    assert (path / "metrics.jsonl").read_bytes() == before
+
+    def refused(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "_sync", refused)
+        with pytest.raises(checkpoint.CheckpointError, match="make room, then resume"):
+            checkpoint.save(path / "checkpoints", 5, {"x": torch.ones(2)})
+    assert list((path / "checkpoints").iterdir()) == []
+
+
+def test_what_a_killed_writer_left_is_cleared_by_the_next_one(tmp_path: Path) -> None:
+    path = a_run(tmp_path / "run")
+    (path / ".tmp-0123456789abcdef-summary.json").write_text("{")
+    (path / ".tmp-0123456789abcdef-mine").write_text("mine")
+    RunFolder.open(path).close()
+    assert [p.name for p in path.iterdir() if p.name.startswith(".tmp")] == [".tmp-0123456789abcdef-mine"]
+    assert json.loads((path / "summary.json").read_bytes())["num_rows"] == 3 and "crc32" not in read_json(
+        path / "summary.json"
+    )
