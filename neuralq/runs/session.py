@@ -113,7 +113,8 @@ class Session:
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns = {"greedy_return": found.mean, "returns": list(found.returns), "num_cut": found.num_cut}
-        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics)
+        scalings = self.stream.encoder.scalings
+        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
 
     def require_finite(self) -> None:
         """Refuse parameters that are no longer finite.
