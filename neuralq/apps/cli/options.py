@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import inspect
 import itertools
 import json
 import re
@@ -234,8 +235,10 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
 
 def _field_help(settings: type) -> dict[str, str]:
     """What each field of a dataclass is for, read from its docstring, so that it is written once."""
-    block = re.split(r"\n {4}\w+:", (settings.__doc__ or "").split("Args:")[1])[0]
-    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
+    # Python 3.13 takes the indentation away when it compiles, and `python -OO` the docstring.
+    text = inspect.cleandoc(settings.__doc__ or "")
+    block = re.split(r"\n\w+:", text.partition("Args:")[2])[0]
+    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {4}(\w+): (.*?)(?=\n {4}\w+:|\Z)", block, re.DOTALL)}
 
 
 def add_fields(
@@ -273,7 +276,7 @@ def add_fields(
         words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
         kind = next((k for k in (hint, *get_args(hint)) if k in words), str)
         shown = "" if default is MISSING else f" (default: {'none' if default is None else default})"
-        text = f"{texts[f.name].rstrip('.')}{shown}".replace("%", "%%")
+        text = f"{texts.get(f.name, f.name.replace('_', ' ')).rstrip('.')}{shown}".replace("%", "%%")
         option = f"--{prefix}{short.get(f.name, f.name)}"
         parser.add_argument(option, dest=prefix + f.name, metavar=words[kind], help=text, **more)
 

@@ -23,8 +23,8 @@ from neuralq.types import Array
 __all__ = ["CLIP", "Normalisation"]
 
 CLIP = 100.0
-"""Standard deviations beyond which nothing is seen: what was as good as constant is not worth more when it moves. In the
-first 10,000 steps of training no observation is further away than that."""
+"""Standard deviations beyond which nothing is seen: what was as good as constant is not worth more when it moves. In
+the first 10,000 steps of training no observation is further away than that."""
 _EPSILON = 1e-8
 
 
