@@ -167,7 +167,7 @@ def build_session(config: RunConfig) -> Session:
     _warm(config, engine, stream)
     return Session(
         stream, policy, experience, learner, generators, evaluation, probe,
-        config.seed, config.evaluation_episodes, config.evaluation_max_steps,
+        config.seed, config.evaluation_episodes, config.evaluation_max_steps, config.reward_scale,
     )  # fmt: skip
 
 
