@@ -24,7 +24,7 @@ from gymnasium import Space, spaces
 from neuralq.runs.stream.scaling import Scaling, scaling_of
 from neuralq.types import Array
 
-__all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "discrete_actions", "encoder_for"]
+__all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "Part", "discrete_actions", "encoder_for"]
 
 MAX_TABLE_STATES = 10_000_000
 """The most states that a table is built for; beyond it a table is no longer the right representation."""
@@ -67,8 +67,8 @@ def _name(keys: tuple[int | str, ...]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """One array of an observation, where to find it and what it must look like."""
+class Part:
+    """One array of an observation: where to find it, what it must look like, and how it is encoded."""
 
     keys: tuple[int | str, ...]
     shape: tuple[int, ...]
@@ -83,9 +83,15 @@ class _Part:
     @property
     def width(self) -> int:
         """Entries that this part takes in a flat vector."""
-        return math.prod(self.shape) if self.sizes is None or self.kinds == _BINARY else sum(self.sizes)
+        return math.prod(self.shape) if self.sizes is None or self.is_binary else sum(self.sizes)
+
+    @property
+    def is_binary(self) -> bool:
+        """Whether its entries are bits, which stand in a flat vector as they are."""
+        return self.kinds == _BINARY
 
     def find(self, observation: Any) -> Any:
+        """This part of an observation, or of a batch."""
         for depth, key in enumerate(self.keys):
             kind: type[Any] = dict if isinstance(key, str) else tuple
             try:
@@ -149,7 +155,7 @@ class _Part:
         """Fill ``out [N, width]`` (zeros) with this part: values, bits or one-hot blocks."""
         if self.sizes is None:
             out[:] = self.floats(batch, out.dtype).reshape(out.shape)
-        elif self.kinds == _BINARY:
+        elif self.is_binary:
             out[:] = self.digits(batch)
         else:
             out[np.arange(len(out))[:, None], self.digits(batch) + self.columns] = 1.0
@@ -165,23 +171,25 @@ class Encoder:
         shape: shape of one encoded observation, without the axis of environments.
         dtype: float32 (float64 where that was asked for), uint8 or bool (frames) or int64 (state indices).
         num_categories: number of states when the encoded observation is a state index (shape ``()``), else None.
+        layout: what becomes of the parts: an "array" or an "image" of its own, one "vector" of all, or an "index".
+        parts: the arrays that an observation consists of.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     num_categories: int | None
-    _layout: Literal["array", "image", "vector", "index"]
-    _parts: tuple[_Part, ...]
+    layout: Literal["array", "image", "vector", "index"]
+    parts: tuple[Part, ...]
 
     @property
     def frame_scaling(self) -> Scaling | None:
         """Of frames, which are encoded as they are: how the network is to scale them. Other numbers are scaled."""
-        return self._parts[0].scaling if self._layout == "image" else None
+        return self.parts[0].scaling if self.layout == "image" else None
 
     @property
     def scalings(self) -> dict[str, list[list[float]]]:
         """Origin and divisor of every part that is scaled, here or in the network, by its name."""
-        return {_name(part.keys): part.scaling.plain() for part in self._parts if part.scaling is not None}
+        return {_name(part.keys): part.scaling.plain() for part in self.parts if part.scaling is not None}
 
     def require_scalings(self, saved: Mapping[str, Any] | None) -> None:
         """Refuse what was learned from observations that were scaled otherwise.
@@ -193,7 +201,7 @@ class Encoder:
         Raises:
             ValueError: with the way out.
         """
-        bytes_ = self._layout == "image" and self.dtype == np.uint8
+        bytes_ = self.layout == "image" and self.dtype == np.uint8
         then = ({"observation": [[0.0], [255.0]]} if bytes_ else {}) if saved is None else dict(saved)
         if then != self.scalings:
             raise ValueError(
@@ -214,16 +222,16 @@ class Encoder:
             >>> encoder.encode({"speed": np.array([[0.5], [-0.5]], np.float32), "gear": np.array([2, 0])}).tolist()
             [[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, -0.5]]
         """
-        if self._layout == "array":
-            return self._parts[0].floats(batched_observation, self.dtype)
-        if self._layout == "image":
-            return self._parts[0].read(batched_observation).copy()
-        if self._layout == "index":
+        if self.layout == "array":
+            return self.parts[0].floats(batched_observation, self.dtype)
+        if self.layout == "image":
+            return self.parts[0].read(batched_observation).copy()
+        if self.layout == "index":
             return self._index(batched_observation)
         num_envs = self._num_envs(batched_observation)
         out = np.zeros((num_envs, *self.shape), self.dtype)
         offset = 0
-        for part in self._parts:
+        for part in self.parts:
             part.write(batched_observation, out[:, offset : offset + part.width])
             offset += part.width
         return out
@@ -238,7 +246,7 @@ class Encoder:
             >>> encoder_for(spaces.Discrete(3, start=5)).encode_single(6).item()
             1
         """
-        nested = bool(self._parts[0].keys)
+        nested = bool(self.parts[0].keys)
         try:
             encoded = self.encode(_add_env_axis(observation) if nested else _as_array(observation)[None])
         except ObservationError as error:
@@ -248,17 +256,17 @@ class Encoder:
 
     def _index(self, batch: Any) -> Array:
         index = np.zeros(self._num_envs(batch), np.int64)
-        for part in self._parts:  # Horner's rule
+        for part in self.parts:  # Horner's rule
             digits = part.digits(batch)
             for entry, size in enumerate(part.sizes or ()):
                 index = index * size + digits[:, entry]
         return index
 
     def _num_envs(self, batch: Any) -> int:
-        lengths = [len(part.read(batch)) for part in self._parts]
-        for part, length in zip(self._parts, lengths, strict=True):
+        lengths = [len(part.read(batch)) for part in self.parts]
+        for part, length in zip(self.parts, lengths, strict=True):
             if length != lengths[0]:
-                problem = f"has {length} rows where {_name(self._parts[0].keys)} has {lengths[0]}"
+                problem = f"has {length} rows where {_name(self.parts[0].keys)} has {lengths[0]}"
                 raise ObservationError(f"{problem}; every part needs one row per environment", field=_name(part.keys))
         return lengths[0]
 
@@ -301,7 +309,7 @@ def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False
     return Encoder((width,), numbers, None, "vector", parts)
 
 
-def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]:
+def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[Part]:
     if isinstance(space, spaces.Tuple):
         for position, inner in enumerate(space.spaces):
             yield from _parts_of(inner, (*keys, position))
@@ -311,7 +319,7 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]
     elif isinstance(space, spaces.Box):
         dtype = np.dtype(space.dtype)
         kinds = _WHOLE if dtype.kind in _WHOLE else dtype.kind
-        yield _Part(keys, space.shape, kinds, dtype, None, scaling=scaling_of(space))
+        yield Part(keys, space.shape, kinds, dtype, None, scaling=scaling_of(space))
     elif isinstance(space, spaces.Discrete):
         yield _discrete_part(keys, (), _WHOLE, space, np.array([space.n]), np.array([space.start]))
     elif isinstance(space, spaces.MultiDiscrete):
@@ -329,14 +337,14 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]
 
 def _discrete_part(
     keys: tuple[int | str, ...], shape: tuple[int, ...], kinds: str, space: Space[Any], sizes: Array, starts: Array
-) -> _Part:
+) -> Part:
     limits = sizes.astype(np.int64)
     columns = np.cumsum(limits) - limits
     dtype = np.dtype(space.dtype)
-    return _Part(keys, shape, kinds, dtype, tuple(limits.tolist()), starts.astype(np.int64), limits, columns)
+    return Part(keys, shape, kinds, dtype, tuple(limits.tolist()), starts.astype(np.int64), limits, columns)
 
 
-def _count_states(space: Space[Any], parts: tuple[_Part, ...]) -> int:
+def _count_states(space: Space[Any], parts: tuple[Part, ...]) -> int:
     way_out = "choose another layout (linear, action-input, separate, action-output)"
     for part in parts:
         if part.sizes is None:
