@@ -10,6 +10,7 @@ import importlib
 import itertools
 import json
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 
 __all__ = [
     "COMMANDS",
+    "DEBUG",
     "Command",
     "CommandParser",
     "Failure",
@@ -70,7 +72,9 @@ EXAMPLES = """examples:
   neuralq resume runs/CartPole-v1-action-output-s0-20260101-120000
   neuralq solve FrozenLake-v1 --gamma 0.95
 
-`neuralq COMMAND --help` tells a command's options. Every command takes --json."""
+`neuralq COMMAND --help` tells a command's options. Every command takes --json and --debug."""
+
+DEBUG = "show the whole traceback of what goes wrong"
 
 
 class Failure(Exception):
@@ -149,6 +153,7 @@ def command_parser(name: str, description: str, *examples: str) -> CommandParser
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    parser.add_argument("--debug", action="store_true", help=DEBUG)
     return parser
 
 
@@ -196,6 +201,8 @@ def _present_folder() -> Iterator[None]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
     if not arguments:
         print(_top_help(), file=sys.stderr)
         return 2
@@ -216,10 +223,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("neuralq: interrupted", file=sys.stderr)
         return 130
-    except (ValueError, RuntimeError, OSError, ImportError, MemoryError) as error:
-        from neuralq.apps.cli.faults import USER_FAULTS
+    except Exception as error:
+        from neuralq.apps.cli.faults import explained
 
-        if not isinstance(error, USER_FAULTS):
+        lines = explained(error)
+        if lines is None:
             raise
-        print(f"neuralq: error: {error}", file=sys.stderr)
+        if debug:
+            traceback.print_exception(error)
+        print(f"neuralq: error: {lines[0]}", *lines[1:], sep="\n", file=sys.stderr)
         return 1

@@ -23,7 +23,7 @@ from neuralq.runs.agent import Agent
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.recipe.games import make_single
-from neuralq.runs.stream import legal_actions
+from neuralq.runs.stream import faults_of, legal_actions
 from neuralq.types import Array
 
 __all__ = ["export"]
@@ -106,7 +106,8 @@ def _played(config: RunConfig, agent: Agent) -> tuple[list[Array], Array]:
     rng = np.random.default_rng(0)
     observations, masks, values = list[Any](), list[Any](), []
     try:
-        observation, info = env.reset(seed=0)
+        with faults_of("at reset"):
+            observation, info = env.reset(seed=0)
         for _ in range(_NUM_OBSERVATIONS):
             mask = legal_actions(env, info)
             observations.append(copy.deepcopy(observation))  # environments may reuse theirs
@@ -114,9 +115,10 @@ def _played(config: RunConfig, agent: Agent) -> tuple[list[Array], Array]:
             values.append(agent.values(observation, mask))
             legal = np.flatnonzero(np.isfinite(values[-1]))
             action = int(rng.choice(legal)) + agent.first_action
-            observation, _, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                observation, info = env.reset()
+            with faults_of("in a step of random play"):
+                observation, _, terminated, truncated, info = env.step(action)
+                if terminated or truncated:
+                    observation, info = env.reset()
     finally:
         env.close()
     return raw_inputs(agent, observations, masks), np.stack(values)

@@ -17,7 +17,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
-from neuralq.apps.cli import Failure
+from neuralq.apps.cli import DEBUG, Failure
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
@@ -52,7 +52,7 @@ _EXAMPLES = """examples:
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
-_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "wandb", "print_config"}
+_WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "print_config"}
 
 
 @dataclass(frozen=True)
@@ -305,6 +305,7 @@ _FLAGS = {
     "tensorboard": "write TensorBoard event files (extra tensorboard)",
     "wandb": "log to Weights & Biases (extra wandb)",
     "json": "print the result as one JSON object on the last line",
+    "debug": DEBUG,
 }
 
 

@@ -292,8 +292,8 @@ def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False
         [9]
     """
     parts = tuple(_parts_of(space, ()))
-    if not parts:
-        raise ValueError(f"{space} holds nothing to observe; give it at least one part, for example Discrete(1)")
+    if not any(part.width for part in parts):
+        raise ValueError(f"{space} holds nothing to observe; give it at least one number, for example Discrete(1)")
     numbers: np.dtype[Any] = np.dtype(np.float32)
     if wide:
         numbers, parts = np.dtype(np.float64), tuple(replace(part, scaling=None) for part in parts)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
@@ -18,7 +20,7 @@ from neuralq.runs.stream.scaling import Scaling
 from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
 from neuralq.types import Array, Transition
 
-__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
+__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "faults_of", "interact"]
 
 
 class Policy(Protocol):
@@ -35,6 +37,24 @@ class Policy(Protocol):
 
 class EnvironmentFault(RuntimeError):
     """An environment broke its contract; says which one, when and in which field."""
+
+
+@contextlib.contextmanager
+def faults_of(doing: str) -> Iterator[None]:
+    """Whatever an environment's own code raises in the block becomes an `EnvironmentFault`.
+
+    Example:
+        >>> with faults_of("resetting"):
+        ...     {}["speed"]
+        Traceback (most recent call last):
+        neuralq.runs.stream.stream.EnvironmentFault: resetting, the environment raised KeyError: 'speed'
+    """
+    try:
+        yield
+    except gym.error.DependencyNotInstalled:  # for which there is a way out
+        raise
+    except Exception as error:
+        raise EnvironmentFault(f"{doing}, the environment raised {type(error).__name__}: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)
