@@ -10,8 +10,8 @@ with variance 2/fan_in below an activation and 1/fan_in in the last layer, biase
 ``sparsity`` that fraction of the inputs of every unit starts at zero and all biases do (Elsayed, Vasan & Mahmood 2024),
 which keeps units apart where steps are large and there is no replay.
 
-Frames come as ``[H, W, C]``, ``[C, H, W]`` or ``[H, W]`` and are stored that way; `Conv` finds out, or is told, where
-the channels are, and turns them inside the network.
+Frames come as ``[H, W, C]``, ``[C, H, W]`` or ``[H, W]``, or as a stack ``[K, …]`` of frames with three axes, and are
+stored that way; `Conv` finds out, or is told, where the channels are, and turns them inside the network.
 """
 
 from __future__ import annotations
@@ -165,7 +165,8 @@ class Trunk(nn.Module):
 class GroupedConv(nn.Module):
     """``copies`` stacks of valid convolutions side by side, grouped: ``[B, *frame] -> [copies, B, d]``.
 
-    The frame's axes are ``[C, H, W]``, ``[H, W, C]`` or ``[H, W]``; ``in_shape`` is what the first convolution takes.
+    The frame's axes are ``[C, H, W]``, ``[H, W, C]`` or ``[H, W]``, or a stack of the first two; ``in_shape`` is what
+    the first convolution takes.
     """
 
     def __init__(
@@ -178,7 +179,9 @@ class GroupedConv(nn.Module):
         self.in_shape = channels_first(in_shape, body.channel_order)
         self.frame_shape = tuple(in_shape)
         # By the order given, not by the shape alone: all three sides may be equal.
-        self.channels_last = body.channel_order == "last" or self.in_shape != self.frame_shape
+        single = self.frame_shape[-3:]
+        auto_last = len(single) == 3 and channels_first(single, body.channel_order) != single
+        self.channels_last = body.channel_order == "last" or auto_last
         channels, height, width = self.in_shape
         gain = None if body.init == "uniform" else _HE
         weights: list[nn.Parameter] = []
@@ -201,9 +204,11 @@ class GroupedConv(nn.Module):
         self.num_features = channels * height * width
 
     def first(self, s: Tensor) -> Tensor:
-        """Frames as the first convolution takes them, not copied: ``[B, *frame] -> [B, C, H, W]``."""
+        """Frames as the first convolution takes them, not copied but for stacks: ``[B, *frame] -> [B, C, H, W]``."""
         if len(self.frame_shape) == 2:
             return s[:, None]
+        if len(self.frame_shape) == 4:
+            return (s.permute(0, 1, 4, 2, 3) if self.channels_last else s).reshape(s.shape[0], *self.in_shape)
         return s.permute(0, 3, 1, 2) if self.channels_last else s
 
     def forward(self, s: Tensor) -> Tensor:
@@ -340,7 +345,7 @@ def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
 
     Args:
         shape: of one observation.
-        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes.
+        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes, or four.
 
     Example:
         >>> body_for((84, 84, 4), True).kernel_sizes, body_for((10, 10), True).kernel_sizes
@@ -348,7 +353,7 @@ def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
         >>> body_for((4,), False).hidden
         (128, 128)
     """
-    if len(shape) == 3 or (len(shape) == 2 and is_frame):
+    if len(shape) in (3, 4) or (len(shape) == 2 and is_frame):
         sides = channels_first(shape)[1:]
         if min(sides) >= 3:
             return replace(NAMED_BODIES["conv" if min(sides) >= 36 else "minatar"], channel_order="auto")  # type: ignore[arg-type]

@@ -26,6 +26,7 @@ from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.recipe.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
@@ -91,7 +92,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
 
 def _load_agent(run_dir: str | Path, best: bool) -> Agent:
     config = config_from_dict(read_config(run_dir))
-    parameters, statistics = _kept(Path(run_dir), best)
+    parameters, statistics, scalings = _kept(Path(run_dir), best)
     envs = make_envs(config, 1)
     try:
         seen = normalisation_for(config, envs)
@@ -99,6 +100,7 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
             seen.load_state_dict(statistics)
             seen = seen.frozen()
         stream = Interaction(envs, config.gamma, 0, config.layout == "table", seen)
+        stream.encoder.require_scalings(scalings)
         q = build_q(config, stream.spec, np.random.default_rng(0))
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
@@ -108,11 +110,11 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
         envs.close()
 
 
-def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
-    """The flat parameters, and the statistics through which observations were seen."""
+def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
+    """The flat parameters, and the statistics and the scales through which observations were seen."""
     if best:
         kept = load_best(run_dir)
-        return kept.parameters, kept.normalisation
+        return kept.parameters, kept.normalisation, kept.scalings
     newest = checkpoint.load_newest(run_dir / "checkpoints")
     saved = newest.state
     compared(saved.get("origin"), read_config(run_dir), newest.path)
@@ -120,7 +122,7 @@ def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
         parameters = state["average"]["values"]
-    return torch.as_tensor(parameters), saved["stream"].get("normalisation")
+    return torch.as_tensor(parameters), saved["stream"].get("normalisation"), saved["stream"].get("scalings")
 
 
 def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool = False) -> Evaluation:
@@ -180,4 +182,5 @@ CONTROL = Kind(
     load=_load_agent,
     notes=_notes,
     changeable=_CHANGEABLE,
+    opening=lambda session: opening_lines(session.stream),
 )

@@ -25,6 +25,7 @@ __all__ = [
     "NOT_EXACT",
     "Diverged",
     "Hook",
+    "Listener",
     "Observer",
     "Plan",
     "Progress",
@@ -59,6 +60,15 @@ class Observer(Protocol):
 
     def __call__(self, row: Mapping[str, Any], /) -> None:
         """Take in one row."""
+        ...
+
+
+@runtime_checkable
+class Listener(Protocol):
+    """A hook that is also told, in a line each, what is worth knowing of a run before it begins."""
+
+    def say(self, line: str, /) -> None:
+        """Take in one line."""
         ...
 
 

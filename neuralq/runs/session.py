@@ -41,6 +41,7 @@ class Session:
         seed: of the run.
         evaluation_episodes: episodes of each evaluation.
         evaluation_max_steps: bound on an evaluation episode where the environment has none.
+        reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
     """
 
     stream: Interaction
@@ -53,6 +54,7 @@ class Session:
     seed: int
     evaluation_episodes: int
     evaluation_max_steps: int
+    reward_scale: float = 1.0
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
@@ -97,8 +99,15 @@ class Session:
         return {"episode_return": recent, "num_updates": self.learner.num_updates, **self._last_metrics()}
 
     def _last_metrics(self) -> dict[str, float]:
-        """Of the last update, which may have been before the run was resumed."""
-        return self._metrics_before if self._last is None else self._last[0].metrics()
+        """Of the last update, which may have been before the run was resumed, in the environment's units."""
+        if self._last is None:
+            return self._metrics_before
+        seen = self.stream.normalisation
+        scale = self.reward_scale * (1.0 if seen is None else seen.reward_scale)
+        return {
+            name: value / (scale * scale if name == "loss" else scale)
+            for name, value in self._last[0].metrics().items()
+        }
 
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""
@@ -113,7 +122,8 @@ class Session:
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns = {"greedy_return": found.mean, "returns": list(found.returns), "num_cut": found.num_cut}
-        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics)
+        scalings = self.stream.encoder.scalings
+        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
 
     def require_finite(self) -> None:
         """Refuse parameters that are no longer finite.

@@ -84,6 +84,10 @@ class ProgressBar(Generic[T]):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._bar.stop()
 
+    def say(self, line: str, /) -> None:
+        """A line above the bar."""
+        self._console.print(f"neuralq: {line}", highlight=False, soft_wrap=True, markup=False)
+
     def __call__(self, report: T, /) -> None:
         """Take in a report."""
         told, now = self._tell(report), self._clock()

@@ -106,7 +106,7 @@ def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: s
     if wandb:
         wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
     if own is not None:
-        wanted.append(lambda: own_hook(own))
+        wanted.append(lambda: own_hook(own, config))
     with contextlib.ExitStack() as stack:
         hooks = []
         for make in wanted:

@@ -52,7 +52,7 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     assert options.seeds is not None
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
     if options.hook is not None:
-        own_hook(options.hook)  # a name that is wrong is one error, not one for each seed
+        own_hook(options.hook, config)  # a name that is wrong is one error, not one for each seed
         flags += ["--hook", options.hook]
     seeds = range(config.seed, config.seed + options.seeds)
     with claimed(options.run_dir, lambda: _default_path(config)) as path:

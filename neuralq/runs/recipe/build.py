@@ -129,7 +129,8 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     if num_categories is not None and config.layout != "table":
         features, shape = OneHot(num_categories), (num_categories,)
     elif spec.dtype == np.uint8:
-        features = Pixels()
+        scaling = spec.frame_scaling
+        features = Pixels(1.0) if scaling is None else Pixels(scaling.divisor, scaling.origin)
     if config.layout == "table":
         if num_categories is None:
             raise ValueError("a table needs finitely many states; choose another layout")
@@ -204,7 +205,7 @@ def build_session(config: RunConfig) -> Session:
     _warm(config, engine, stream)
     return Session(
         stream, policy, experience, learner, generators, evaluation, probe,
-        config.seed, config.evaluation_episodes, config.evaluation_max_steps,
+        config.seed, config.evaluation_episodes, config.evaluation_max_steps, config.reward_scale,
     )  # fmt: skip
 
 
