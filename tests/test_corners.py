@@ -127,6 +127,8 @@ def learns(learner: str, settings: Any, world: dict[str, Any], **more: Any) -> N
                 break
         assert session.learner.num_updates >= 10, settings
         assert bool(torch.isfinite(session.learner.engine.flat.values).all()), settings
+    except ValueError as reported:  # a step size of 1 may diverge, and says so
+        assert "training diverged" in str(reported) and re.search("step_size(_h)?=1", repr(settings)), settings
     finally:
         session.close()
 

@@ -7,6 +7,7 @@ whose variance overflows and gives a constant; a bound of infinity that makes ev
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,20 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuralq.learners import ReplaySettings
 from neuralq.learners.descent import Descent
 from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_, clip_norm_on_device_
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.learners.traces import streaming_kernels as kernels
 from neuralq.learners.traces.streaming import StreamingLearner, StreamingSettings
-from neuralq.q import MLP, ActionOutputQ, LinearQ
+from neuralq.q import MLP, ActionOutputQ, CategoricalQ, LinearQ
 from neuralq.q.compiled import make_engine
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.single_row import SingleRowNetwork
+from neuralq.rules import categorical_projection
 from neuralq.rules import streaming as rules
+from neuralq.runs import RunConfig
+from neuralq.runs.recipe import build
 from neuralq.types import Transition
 
 CLIPS = [clip_norm_, clip_norm_on_device_, lambda g, most: clip_norm_(g.numpy(), most)]
@@ -137,3 +143,56 @@ def test_running_squares_that_overflow_are_no_silence(bound: str, kind: str) -> 
     for _ in range(64):
         learner.update(Transition(x, torch.tensor([0]), one, one, one, x, torch.tensor([False])))
     assert torch.isnan(learner.engine.flat.values).any()  # which the run reports as divergence
+
+
+def test_a_reward_that_float32_cannot_hold_is_refused_where_it_enters() -> None:
+    buffer, x = ReplayBuffer(8, (2,), np.float32), np.zeros(2, np.float32)
+    for reward in (1e39, -1e39, math.inf, math.nan):
+        with pytest.raises(ValueError, match=r"rewards are stored in float32, up to 3\.4e\+38; scale it where the"):
+            buffer.add_step(0, x, 1, 0.5, reward, 0.9, x, False)
+        rows = (x[None], np.array([1]), np.ones(1), np.array([reward]), np.ones(1), x[None], np.array([False]))
+        with pytest.raises(ValueError, match="rewards are stored in float32"):
+            buffer.add(Transition(*rows))  # type: ignore[arg-type]
+    assert len(buffer) == 0
+    buffer.add_step(0, x, 1, 0.5, -3e38, 0.9, x, False)
+    assert buffer.sample(1, np.random.default_rng(0)).transition.r_t.item() == pytest.approx(-3e38)
+
+
+def test_a_grid_of_returns_finer_than_float32_is_refused() -> None:
+    # Near 10⁸ float32 has every eighth whole number: 51 atoms from 10⁸ to 10⁸ + 128 would be 17.
+    assert len(np.unique(np.linspace(1e8, 1e8 + 128, 51).astype(np.float32))) == 17
+    for low, high in ((1e8, 1e8 + 128), (-1e6 - 5, -1e6), (1.0, 1.0 + 1e-6), (-3e38, 3e38)):
+        with pytest.raises(ValueError, match=r"51 atoms from .* lie closer together than torch.float32 tells apart"):
+            CategoricalQ(LinearQ(2, 102, dtype=torch.float32), 51, low, high)
+    # What is accepted keeps the mass of what is moved onto it, and its mean.
+    for low, high in ((0.0, 500.0), (1e4, 1.1e4), (-1e30, 1e30)):
+        support = CategoricalQ(LinearQ(2, 102, dtype=torch.float32), 51, low, high).support
+        values = torch.linspace(low, high, 999)
+        moved = categorical_projection(values, torch.full((999,), 1 / 999), support)
+        assert moved.sum().item() == pytest.approx(1.0, abs=0.01)
+        assert (moved * support / high).sum().item() == pytest.approx((low + high) / 2 / high, abs=0.01)
+
+
+def test_a_capacity_that_may_hold_no_block_is_refused_before_the_run() -> None:
+    # Rows of 1200 bytes are stored once where a stream goes on; in episodes of one step each takes two of 8 + 2 rows.
+    spec: Any = SimpleNamespace(shape=(300,), dtype=np.dtype(np.float32))
+    blocks: dict[str, Any] = {"target_rule": "peng", "block_length": 8, "learning_starts": 8, "batch_size": 8}
+    with pytest.raises(ValueError, match=r"capacity=8 may hold no block of block_length=8: .* take at least 16"):
+        build._replay(ReplaySettings(capacity=8, **blocks), spec, np.random.default_rng(0))
+    source = build._replay(ReplaySettings(capacity=16, **blocks), spec, np.random.default_rng(0))
+    for t in range(100):
+        x = np.full(300, t, np.float32)
+        source.buffer.add_step(0, x, 0, 1.0, 0.0, 0.0, x + 0.5, True)  # type: ignore[attr-defined]
+    assert source.buffer.sample_blocks(2, 8, np.random.default_rng(0)).r_t.shape == (8, 2)  # type: ignore[attr-defined]
+
+
+def test_a_discount_or_scale_that_float32_takes_for_another_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"gamma=0.99999999 is 1 in float32"):
+        RunConfig(gamma=0.99999999)
+    with pytest.raises(ValueError, match=r"gamma=0.99999999 is 1 in float32"):
+        RunConfig(env="FrozenLake-v1", layout="table", learner="replay", gamma=0.99999999)
+    assert RunConfig(env="FrozenLake-v1", layout="table", gamma=0.99999999).gamma == 0.99999999  # tables are float64
+    assert RunConfig(gamma=1.0).gamma == 1.0
+    for scale in (1e-40, 1e39):
+        with pytest.raises(ValueError, match=r"reward_scale=.* is beyond float32"):
+            RunConfig(reward_scale=scale)

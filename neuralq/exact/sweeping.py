@@ -75,9 +75,9 @@ class _Constant:
         down, up = problem.interval(least, largest)
         error = (up - down) / 2 if problem.uniform else max(up, -down, 0.0)
         floor = problem.reach * problem.rounding(v)
-        done = error + floor <= self._tol
-        stalls = not done and (self._progress.stalls(error) or error <= floor)
-        if not (done or stalls or last):
+        enough = error + floor <= self._tol
+        stalls = not enough and (self._progress.stalls(error) or error <= floor)
+        if not (enough or stalls or last):
             return False
         if not problem.uniform:
             return True

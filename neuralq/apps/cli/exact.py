@@ -33,7 +33,7 @@ _FROZEN_LAKE, _CLIFF_WALKING = (3, 2, 1, 0), (0, 1, 2, 3)
 def solve(argv: list[str]) -> int:
     """Solve the model of an environment and print values, policy and the guaranteed bound."""
     options = _parser().parse_args(argv)
-    mdp, layout = _model(options.env, options.env_kwargs)
+    mdp, layout, limit = _model(options.env, options.env_kwargs, check=not options.no_check)
     solution = solve_mdp(mdp, options.gamma, options.method, options.tol, max_iterations=options.max_iterations)
     grid, lines = None, _table(mdp, solution)
     if layout is not None:
@@ -51,6 +51,7 @@ def solve(argv: list[str]) -> int:
         "gamma": options.gamma,
         "method": solution.method,
         "num_states": mdp.num_states,
+        "max_episode_steps": limit,
         "v": solution.v.tolist(),
         "policy": solution.policy.tolist(),
         "optimal_actions": actions,
@@ -61,7 +62,8 @@ def solve(argv: list[str]) -> int:
         "converged": solution.converged,
         "seconds": solution.seconds,
     }
-    print_result(plain, options.json, [*lines, *_summary(solution)])
+    cut = [] if limit is None else [f"episodes are cut after {limit:,} steps; these are the values without the cut"]
+    print_result(plain, options.json, [*lines, *_summary(solution), *cut])
     if not solution.converged:
         raise Failure(f"did not converge: the error may be as large as {solution.bound:.3g}; allow a larger --tol")
     return 0
@@ -92,6 +94,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
     )
+    parser.add_argument(
+        "--no-check",
+        action="store_true",
+        help="take the table as it stands; else a few thousand steps of the environment are compared with it first",
+    )
     parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
     return parser
 
@@ -111,12 +118,12 @@ def _json_object(text: str) -> dict[str, Any]:
     return value
 
 
-def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | None]:
+def _model(env_id: str, kwargs: dict[str, Any], *, check: bool) -> tuple[FiniteMDP, _Layout | None, int | None]:
     with refusals_name(env_id):
         env = make_single(env_id, kwargs)
     try:
-        mdp = FiniteMDP.from_gymnasium(env)
-        return mdp, _layout(env.unwrapped, mdp)
+        mdp = FiniteMDP.from_gymnasium(env, check=check)
+        return mdp, _layout(env.unwrapped, mdp), None if env.spec is None else env.spec.max_episode_steps
     finally:
         env.close()
 

@@ -252,8 +252,15 @@ def _rollouts(settings: Any, spec: ObservationSpec, rng: np.random.Generator) ->
 
 
 def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
+    buffer = _buffer(settings, spec, settings.capacity)
+    if settings.block_length > max(1, buffer.least_steps):
+        raise ValueError(
+            f"capacity={settings.capacity} may hold no block of block_length={settings.block_length}: observations of "
+            "this size are stored once where streams go on, and short episodes take twice the room; take at least "
+            f"{2 * settings.block_length * settings.num_envs}"
+        )
     return ReplayExperience(
-        _buffer(settings, spec, settings.capacity), rng, settings.batch_size, settings.block_length,
+        buffer, rng, settings.batch_size, settings.block_length,
         settings.learning_starts, settings.train_period, settings.updates_per_period,
     )  # fmt: skip
 

@@ -9,6 +9,8 @@ from numbers import Real
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
@@ -19,6 +21,7 @@ __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
+_SINGLE = np.finfo(np.float32)
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 _Class = TypeVar("_Class")
 
@@ -117,6 +120,7 @@ class RunConfig:
         check_choice("engine", self.engine, ("auto", "torch", "compiled"))
         check_discount("gamma", self.gamma)
         check_positive("reward_scale", self.reward_scale)
+        _check_single(self)
         check_fraction("epsilon_start", self.epsilon_start)
         check_fraction("epsilon_end", self.epsilon_end)
         check_whole("seed", self.seed, 0)
@@ -164,6 +168,17 @@ def _check_body(config: RunConfig) -> None:
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
     if config.engine == "compiled" and (config.layout not in NETWORKS or not isinstance(config.body or MLP(), MLP)):
         raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+
+
+def _check_single(config: RunConfig) -> None:
+    """Networks and replay compute in float32, which must be able to tell γ from 1 and the scale from 0."""
+    if config.layout not in NETWORKS and LEARNERS[config.learner].experience != "replay":
+        return
+    gamma, scale = float(np.float32(config.gamma)), config.reward_scale
+    if gamma == 1 and config.gamma < 1:
+        raise ValueError(f"gamma={config.gamma!r} is 1 in float32, which networks compute in; use 1, or 0.9999999")
+    if not float(_SINGLE.tiny) <= scale <= float(_SINGLE.max):
+        raise ValueError(f"reward_scale={scale!r} is beyond float32, which networks compute in; use one nearer 1")
 
 
 def _check_outputs(config: RunConfig) -> None:
