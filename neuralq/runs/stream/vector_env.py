@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -138,10 +139,18 @@ def make_vector_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> Syn
         2
     """
     check_whole("num_envs", num_envs)
-    return SyncVectorEnv(
-        [partial(_sub_env, make, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
-    )
-
-
-def _sub_env(make: Callable[[], gym.Env[Any, Any]], index: int) -> SubEnv:
-    return SubEnv(make(), index)
+    made: list[gym.Env[Any, Any]] = []
+    try:
+        for index in range(num_envs):
+            made.append(make())
+            made[-1] = SubEnv(made[-1], index)
+        return SyncVectorEnv(
+            [partial(made.__getitem__, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
+        )
+    except BaseException as error:
+        for env in made:
+            with contextlib.suppress(Exception):
+                env.close()
+        if 0 < len(made) < num_envs and isinstance(error, Exception):
+            error.add_note(f"{len(made)} of {num_envs} were made before; there may have to be fewer at a time")
+        raise
