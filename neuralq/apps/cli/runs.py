@@ -43,9 +43,8 @@ def train(argv: list[str]) -> int:
     with claimed(options.run_dir, lambda: CONTROL.default_path(config)) as path:
         refuse_old_run(path)  # also by the run, but preparing takes seconds
         origin = started_from(config, options)
-        say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
-        if config.resume_probe:
-            say("the environment is tried for a second, whether it can be saved and put back (--resume-probe false)")
+        probed = "; for a second it is tried how exactly the environment can be resumed" if config.resume_probe else ""
+        say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
         with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
             run = CONTROL.train(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
