@@ -85,7 +85,7 @@ class Run:
 
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
     return Run(
-        run_dir=folder.path,
+        run_dir=folder.named,
         env_steps=session.env_steps,
         cpu_seconds=progress.cpu_seconds,
         wall_seconds=progress.wall_seconds,

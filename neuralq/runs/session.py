@@ -16,7 +16,7 @@ from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder.best import Best
-from neuralq.runs.folder.env_encode import encode_env
+from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
@@ -186,9 +186,23 @@ class Session:
             "learner": self.learner.state_dict(),
             "feed": self.experience.state_dict(),
             "stream": self.stream.state_dict(),
-            "environments": encode_env(self.stream.envs) if self.resumability.exact else None,
+            "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
         }
+
+    def _environments(self) -> dict[str, Any] | None:
+        """The environments' own state; None where it cannot be taken, or no longer can."""
+        if not self.resumability.exact:
+            return None
+        try:
+            return encode_env(self.stream.envs)
+        except NotCopyable as error:
+            self._inexact(f"after {self.env_steps:,} steps the environment's state can no longer be saved: {error}")
+            return None
+
+    def _inexact(self, why: str) -> None:
+        self.resumability = Resumability(False, f"resumes at an episode boundary, not bit-exact: {why}")
+        warnings.warn(self.resumability.reason, stacklevel=2)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`.
@@ -204,14 +218,23 @@ class Session:
         self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]
-        if state["environments"] is not None:
-            restore_env(self.stream.envs, state["environments"])
+        if self._restored(state["environments"]):
             self.stream.load_state_dict(state["stream"])
         else:
             self.stream.load_normalisation(state["stream"])
             self.stream.restart(seed_for(self.seed, 8, progress["env_steps"]))
             self.stream.num_steps = progress["env_steps"]
             self.learner.begin_streams()
+
+    def _restored(self, environments: Mapping[str, Any] | None) -> bool:
+        if environments is None:
+            return False
+        try:
+            restore_env(self.stream.envs, environments)
+        except NotCopyable as error:
+            self._inexact(f"the environment's saved state could not be put back: {error}")
+            return False
+        return True
 
     def close(self) -> None:
         """Close the environments."""
