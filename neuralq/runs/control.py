@@ -17,14 +17,23 @@ from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
 from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.evaluation import MOST_STEPS, Evaluation, evaluate_greedy
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
+from neuralq.runs.folder.files import read_rows
 from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
-from neuralq.runs.recipe.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
+from neuralq.runs.recipe.build import (
+    build_q,
+    build_session,
+    engine_name,
+    make_envs,
+    make_evaluation_envs,
+    normalisation_for,
+    plan_of,
+)
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
@@ -77,7 +86,7 @@ class Run:
 
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
     return Run(
-        run_dir=folder.path,
+        run_dir=folder.named,
         env_steps=session.env_steps,
         cpu_seconds=progress.cpu_seconds,
         wall_seconds=progress.wall_seconds,
@@ -139,15 +148,21 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
     config = config_from_dict(read_config(run_dir))
     agent = _load_agent(run_dir, best)
     with limited_threads(config.threads):
-        envs = make_envs(config, min(num_episodes, 64))
+        envs = make_evaluation_envs(config, min(num_episodes, 64))
         try:
             stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
             with torch.no_grad():
-                return evaluate_greedy(
-                    agent.q.all, stream, num_episodes, seed_for(seed, 7), config.evaluation_max_steps
-                )
+                most = config.evaluation_max_steps or _last_cap(run_dir)
+                return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
         finally:
             envs.close()
+
+
+def _last_cap(run_dir: str | Path) -> int:
+    """After how many steps the run's own evaluations were cut, where they learned that in training."""
+    rows = read_rows(Path(run_dir) / "metrics.jsonl")
+    caps = (row["max_steps"] for row in reversed(rows) if isinstance(row.get("max_steps"), int))
+    return max(1, next(caps, MOST_STEPS))
 
 
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
@@ -161,11 +176,18 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
         notes.append(f"greedy {latest['greedy_return']:.1f}{goal}")
+    if latest.get("num_cut"):
+        notes.append(f"{latest['num_cut']} of {len(latest['returns'])} evaluation episodes cut")
     return notes
 
 
 _CHANGEABLE = frozenset(
-    "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every".split()
+    (
+        *"stop_at_return evaluate_every evaluation_episodes evaluation_max_steps".split(),
+        "checkpoint_every",
+        "log_every",
+        "resume_probe",
+    )
 )
 CONTROL = Kind(
     name="control",

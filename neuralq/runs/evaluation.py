@@ -17,7 +17,10 @@ from neuralq.runs.stop_request import raise_if_asked
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.acting import choose_greedy
 
-__all__ = ["Evaluation", "evaluate_greedy"]
+__all__ = ["MOST_STEPS", "Evaluation", "evaluate_greedy"]
+
+MOST_STEPS = 10_000
+"""After so many an episode is cut where nothing else is said."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +68,7 @@ class Evaluation:
 
 
 def evaluate_greedy(
-    values: Callable[[Tensor], Tensor], stream: Interaction, num_episodes: int, seed: int, max_steps: int = 10_000
+    values: Callable[[Tensor], Tensor], stream: Interaction, num_episodes: int, seed: int, max_steps: int = MOST_STEPS
 ) -> Evaluation:
     """Play ``num_episodes`` greedy episodes.
 

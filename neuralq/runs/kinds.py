@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -89,7 +90,7 @@ class Kind(Generic[C, T, R]):
         num_threads: CPU threads for linear algebra.
         build: what trains, freshly made, with compiled kernels warm.
         plan: when a run is evaluated, saved and stopped.
-        result: of a run that has ended; may leave files of its own in the folder.
+        result: of a run that has ended, which is told by the name it was given; may leave files there.
         load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
         opening: what is worth saying of what trains, once, before it does.
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
@@ -117,7 +118,7 @@ class Kind(Generic[C, T, R]):
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
         plain, seed, request = self.to_plain(config), self.plan(config).seed, StopRequest()
-        with claimed(run_dir, lambda: self.default_path(config)) as path:
+        with claimed(run_dir, lambda: self.default_path(config)) as path, same_folder() as here:
             refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
             with (
                 request.listening((signal.SIGINT,)),
@@ -125,7 +126,8 @@ class Kind(Generic[C, T, R]):
                 contextlib.closing(self.build(config)) as trainee,
             ):
                 _end_if_asked(request)
-                with RunFolder.create(path, config=plain, seed=seed) as folder:
+                with RunFolder.create(here / path, config=plain, seed=seed) as folder:
+                    folder.named = path
                     folder.free = self.free
                     result = self._finish(config, trainee, Progress(), folder, hooks)
                 _end_if_asked(request)
@@ -142,13 +144,14 @@ class Kind(Generic[C, T, R]):
         stored, request = self.from_plain(read_config(run_dir)), StopRequest()
         config = self.changed(stored, budget, changes)
         with (
+            same_folder() as here,
             request.listening((signal.SIGINT,)),
             limited_threads(self.num_threads(config)),
-            RunFolder.open(run_dir) as folder,
+            RunFolder.open(here / run_dir) as folder,
             contextlib.closing(self.build(config)) as trainee,
         ):
             _end_if_asked(request)
-            folder.free = self.free
+            folder.free, folder.named = self.free, Path(run_dir)
             progress = continued(trainee, folder)
             plan, before = self.plan(config), self.plan(stored)
             if trainee.amount > plan.budget and plan.budget < before.budget:
@@ -197,10 +200,29 @@ class Kind(Generic[C, T, R]):
                         hook.say(line)
             fit(trainee, plan, progress, folder, hooks)
         else:
-            warnings.warn(_nothing_left(self, plan, progress, folder.path, reached), stacklevel=3)
+            warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)
         folder.write_summary(result.plain())
         return result
+
+
+@contextlib.contextmanager
+def same_folder() -> Iterator[Path]:
+    """The present folder, which is the present folder again after the block: environments may change it.
+
+    Example:
+        >>> import os
+        >>> with same_folder() as here:
+        ...     os.chdir("/")
+        >>> Path.cwd() == here
+        True
+    """
+    here = Path.cwd()
+    try:
+        yield here
+    finally:
+        with contextlib.suppress(OSError):  # it may be gone
+            os.chdir(here)
 
 
 def _end_if_asked(request: StopRequest) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,7 @@ from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder.best import Best
-from neuralq.runs.folder.env_encode import encode_env
+from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
@@ -23,7 +24,7 @@ from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Interaction, Policy
 from neuralq.runs.stream.experience import ExperienceSource, Sample
 
-__all__ = ["Session"]
+__all__ = ["Session", "cap_on_evaluation"]
 
 
 @dataclass
@@ -36,11 +37,13 @@ class Session:
         experience: between stream and learner.
         learner: what learns.
         generators: every generator in use, by name.
-        evaluation_stream: an interaction with an environment made for evaluation.
+        make_evaluation: makes an interaction with environments of its own for evaluation; called when first needed.
         resumability: whether the environments' state can be saved.
         seed: of the run.
         evaluation_episodes: episodes of each evaluation.
-        evaluation_max_steps: bound on an evaluation episode where the environment has none.
+        evaluation_max_steps: bound on an evaluation episode where the environment has none; None to learn one from
+            the episodes of training (`cap_on_evaluation`).
+        evaluate_every: environment steps between evaluations.
         reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
     """
 
@@ -49,15 +52,30 @@ class Session:
     experience: ExperienceSource
     learner: Learner
     generators: dict[str, np.random.Generator]
-    evaluation_stream: Interaction
+    make_evaluation: Callable[[], Interaction]
     resumability: Resumability
     seed: int
     evaluation_episodes: int
-    evaluation_max_steps: int
+    evaluation_max_steps: int | None
+    evaluate_every: int
     reward_scale: float = 1.0
+    _evaluation: Interaction | None = field(init=False, default=None)
+    _cannot_evaluate: bool = field(init=False, default=False)
+    _longest: int = field(init=False, default=0)
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
+
+    @property
+    def evaluation_stream(self) -> Interaction:
+        """The interaction in which greedy episodes are played, made when it is first asked for.
+
+        Raises:
+            ValueError: if the environment cannot be made beside those of training.
+        """
+        if self._evaluation is None:
+            self._evaluation = self.make_evaluation()
+        return self._evaluation
 
     @property
     def amount(self) -> int:
@@ -84,6 +102,7 @@ class Session:
             experience.add(step)
             for episode in step.episodes:
                 self._recent_returns.append(episode.episode_return)
+                self._longest = max(self._longest, episode.length)
             for sample in experience.draw():
                 transition = sample.transition if on_cpu else sample.transition.map(lambda x: x.to(device))
                 # Weights stay on the host: which are 0 is asked there, and learners that multiply by them move them.
@@ -114,16 +133,43 @@ class Session:
         with evaluating_with(self.learner):
             return evaluate_greedy(
                 self.learner.engine.all, self.evaluation_stream, self.evaluation_episodes, seed,
-                self.evaluation_max_steps,
+                self._cap(),
             )  # fmt: skip
 
     def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
-        """Returns of greedy episodes, and the parameters that played them."""
+        """Returns of greedy episodes, and the parameters that played them.
+
+        An environment that can exist only once is not evaluated, which a warning says.
+        """
+        if not self._can_evaluate():
+            return {}, None
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
-        columns = {"greedy_return": found.mean, "returns": list(found.returns), "num_cut": found.num_cut}
+        columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
+        columns["num_cut"] = found.num_cut
+        if self.evaluation_max_steps is None:
+            columns["max_steps"] = self._cap()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def _cap(self) -> int:
+        if self.evaluation_max_steps is not None:
+            return self.evaluation_max_steps
+        longest = max(self._longest, *(length for _, length in self.stream.running_episodes()))
+        return cap_on_evaluation(longest, self.evaluate_every, self.evaluation_episodes)
+
+    def _can_evaluate(self) -> bool:
+        if self._evaluation is None and not self._cannot_evaluate:
+            try:
+                _ = self.evaluation_stream
+            except ValueError as error:
+                self._cannot_evaluate = True
+                warnings.warn(
+                    f"the run is not evaluated: beside the environments of training there can be no other ({error}); "
+                    "neuralq evaluate plays it when training has ended",
+                    stacklevel=2,
+                )
+        return not self._cannot_evaluate
 
     def require_finite(self) -> None:
         """Refuse parameters that are no longer finite.
@@ -146,13 +192,28 @@ class Session:
                 "env_steps": self.env_steps,
                 "recent_returns": list(self._recent_returns),
                 "last_metrics": self._last_metrics(),
+                "longest_episode": self._longest,
             },
             "learner": self.learner.state_dict(),
             "feed": self.experience.state_dict(),
             "stream": self.stream.state_dict(),
-            "environments": encode_env(self.stream.envs) if self.resumability.exact else None,
+            "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
         }
+
+    def _environments(self) -> dict[str, Any] | None:
+        """The environments' own state; None where it cannot be taken, or no longer can."""
+        if not self.resumability.exact:
+            return None
+        try:
+            return encode_env(self.stream.envs)
+        except NotCopyable as error:
+            self._inexact(f"after {self.env_steps:,} steps the environment's state can no longer be saved: {error}")
+            return None
+
+    def _inexact(self, why: str) -> None:
+        self.resumability = Resumability(False, f"resumes at an episode boundary, not bit-exact: {why}")
+        warnings.warn(self.resumability.reason, stacklevel=2)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict`.
@@ -163,12 +224,12 @@ class Session:
         progress = state["progress"]
         self._recent_returns.extend(progress["recent_returns"])
         self._metrics_before = progress["last_metrics"]
+        self._longest = int(progress.get("longest_episode", 0))
         self.learner.load_state_dict(state["learner"])
         self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]
-        if state["environments"] is not None:
-            restore_env(self.stream.envs, state["environments"])
+        if self._restored(state["environments"]):
             self.stream.load_state_dict(state["stream"])
         else:
             self.stream.load_normalisation(state["stream"])
@@ -176,8 +237,31 @@ class Session:
             self.stream.num_steps = progress["env_steps"]
             self.learner.begin_streams()
 
+    def _restored(self, environments: Mapping[str, Any] | None) -> bool:
+        if environments is None:
+            return False
+        try:
+            restore_env(self.stream.envs, environments)
+        except NotCopyable as error:
+            self._inexact(f"the environment's saved state could not be put back: {error}")
+            return False
+        return True
+
     def close(self) -> None:
         """Close the environments."""
-        for stream in (self.stream, self.evaluation_stream):
+        for stream in filter(None, (self.stream, self._evaluation)):
             with contextlib.suppress(Exception):
                 stream.envs.close()
+
+
+def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:
+    """Steps after which an evaluation episode is cut where the environment has no time limit.
+
+    Ten times the longest episode that training has seen, between 100 and 10,000; and all episodes together may take
+    ten times the steps between two evaluations: a policy that never arrives would else be watched for hours.
+
+    Example:
+        >>> cap_on_evaluation(30, 4096, 20), cap_on_evaluation(4096, 4096, 20), cap_on_evaluation(0, 64, 20)
+        (300, 2048, 100)
+    """
+    return max(100, min(10 * longest, 10 * evaluate_every // num_episodes, 10_000))

@@ -17,7 +17,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 __all__ = [
     "COMMANDS",
@@ -91,10 +91,14 @@ class Failure(Exception):
 def print_result(result: dict[str, Any], as_json: bool, lines: Sequence[str]) -> None:
     """The result for people, or, with ``--json``, as one JSON object on the last line of standard output."""
     if as_json:
-        print(json.dumps(result, allow_nan=False), flush=True)
+        print(json.dumps(result, allow_nan=False), flush=True, file=_output.get())
         return
     for line in lines:
-        print(line, flush=True)
+        print(line, flush=True, file=_output.get())
+
+
+_output: contextvars.ContextVar[TextIO | None] = contextvars.ContextVar("_output", default=None)
+"""Standard output as it was when the command began: environments print into it, or put something else in its place."""
 
 
 def _show_warning(
@@ -222,6 +226,17 @@ def _listening() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextlib.contextmanager
+def _own_output(as_json: bool) -> Iterator[None]:
+    """With ``--json`` nothing but the result gets onto standard output; what else is printed goes beside it."""
+    token = _output.set(sys.stdout)
+    with contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout):
+        try:
+            yield
+        finally:
+            _output.reset(token)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage, 130 interrupted."""
     with contextlib.ExitStack() as stack:
@@ -246,7 +261,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return _top(arguments[0])
     module, function = COMMANDS[arguments[0]][:2]
     try:
-        with _present_folder(), warnings.catch_warnings():
+        with _present_folder(), warnings.catch_warnings(), _own_output("--json" in arguments):
             command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
             warnings.showwarning = _show_warning
             return command(arguments[1:])

@@ -16,9 +16,10 @@ from neuralq.apps.cli.sweeps import resume_seeds, single_run, started_from, trai
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
+from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
+from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
@@ -42,7 +43,8 @@ def train(argv: list[str]) -> int:
     with claimed(options.run_dir, lambda: CONTROL.default_path(config)) as path:
         refuse_old_run(path)  # also by the run, but preparing takes seconds
         origin = started_from(config, options)
-        say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels)")
+        probed = "; for a second it is tried how exactly the environment can be resumed" if config.resume_probe else ""
+        say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
         with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
             run = CONTROL.train(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
@@ -163,10 +165,24 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     notes = []
     if best is not None and run.greedy_return is not None and best > run.greedy_return:
         notes.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
+    if (cut := _cut(run)) is not None:
+        notes.append(cut)
     status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
         raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
     return status
+
+
+def _cut(run: Run) -> str | None:
+    """A line where the last evaluation had to be cut short."""
+    rows = [row for row in read_metrics(run.run_dir) if row.get("kind") == "evaluation"]
+    if not rows or not rows[-1].get("num_cut"):
+        return None
+    most = rows[-1].get("max_steps") or read_config(run.run_dir).get("evaluation_max_steps") or MOST_STEPS
+    return (
+        f"{rows[-1]['num_cut']} of {len(rows[-1]['returns'])} evaluation episodes were cut off after {most:,} steps: "
+        "the environment did not end them (--evaluation-max-steps sets how many)"
+    )
 
 
 def _best_return(run: Run) -> float | None:

@@ -88,6 +88,13 @@ def encode_env(env: Any) -> dict[str, Any]:
         return {"snapshot": FORMAT_VERSION, "root": Encoder().encode(env, "env", type(env))}
     except RecursionError as error:
         raise NotCopyable("env holds structures that are nested too deeply to be copied") from error
+    except NotCopyable:
+        raise
+    except Exception as error:  # objects of C++ libraries answer to nothing that every Python object has
+        raise NotCopyable(
+            f"env holds an object that cannot be looked into (asked for its parts it raised {type(error).__name__}: "
+            f"{error})"
+        ) from error
 
 
 @dataclass

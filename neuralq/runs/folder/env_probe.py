@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,10 +18,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from neuralq.runs.folder.env_encode import Encoder, NotCopyable, difference, encode_env
 from neuralq.runs.folder.env_restore import restore_env
 
-__all__ = ["Resumability", "is_resumable"]
+__all__ = ["PROBE_SECONDS", "Resumability", "is_resumable", "untried"]
 
 NUM_STEPS_BEFORE = 25  # most episodes are under way by then, and some have ended
 NUM_STEPS_AFTER = 50
+PROBE_SECONDS = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +39,33 @@ class Resumability:
         raise TypeError("ask for .exact: a Resumability is neither true nor false")
 
 
-def is_resumable(make_env: Callable[[], Any], seed: int, rng: np.random.Generator) -> Resumability:
-    """Two instances, one continued and one restored from a snapshot, must agree in every bit of 50 steps and a reset.
+def untried(env: Any) -> Resumability:
+    """Whether the state of ``env`` can be taken; whether that is all of its state is not tried.
+
+    Example:
+        >>> untried(gymnasium.make("CartPole-v1")).exact
+        True
+    """
+    try:
+        encode_env(env)
+    except NotCopyable as error:
+        return _inexact(str(error))
+    return Resumability(True, "resumes from the environment's own state; whether bit-exact was not tried")
+
+
+def is_resumable(
+    make_env: Callable[[], Any], seed: int, rng: np.random.Generator, seconds: float = math.inf
+) -> Resumability:
+    """Two instances, one continued and one restored from a snapshot, must agree in every bit of 60 steps and a reset.
+
+    Where the environment is slow there are fewer, at least one: a third of ``seconds`` goes into each of the steps
+    before the snapshot, those after it, and their repetition; making and resetting the environment comes on top.
 
     Args:
         make_env: makes the environment (`gymnasium.Env` or `gymnasium.vector.VectorEnv`); called twice, both closed.
         seed: of the first reset.
         rng: draws the random actions; an ``action_mask`` in info or observation is obeyed.
+        seconds: that this may take, about.
 
     Example:
         >>> is_resumable(lambda: gymnasium.make("CartPole-v1"), 0, np.random.default_rng(0)).exact
@@ -53,16 +76,15 @@ def is_resumable(make_env: Callable[[], Any], seed: int, rng: np.random.Generato
         envs.append(make_env())
         first = _Driver(envs[0], rng)
         first.reset(seed)
-        for _ in range(NUM_STEPS_BEFORE):
-            first.step(None)
-        tree, ended = encode_env(envs[0]), first.ended
+        first.run(NUM_STEPS_BEFORE, seconds / 3)
+        tree, ended, num_before = encode_env(envs[0]), first.ended, len(first.actions)
         # The original goes on first: whatever it shares behind the scenes with the second has moved on by then.
-        reference = first.course(None)
+        reference = first.course(None, seconds / 3)
         envs.append(make_env())
         second = _Driver(envs[1], rng)
         restore_env(envs[1], tree)
         second.ended = ended
-        where = difference(reference, second.course(first.actions[NUM_STEPS_BEFORE:]), "step")
+        where = difference(reference, second.course(first.actions[num_before:]), "step")
     except NotCopyable as error:
         return _inexact(str(error))
     except Exception as error:  # the environment's own code ran: whatever it raises, training will say it better
@@ -73,7 +95,7 @@ def is_resumable(make_env: Callable[[], Any], seed: int, rng: np.random.Generato
                 env.close()
     if where is not None:
         return _inexact(f"a restored environment went another way ({where}): it has state outside of its attributes")
-    shown = NUM_STEPS_AFTER + NUM_STEPS_AFTER // 5
+    shown = len(first.actions) - num_before
     return Resumability(
         True, f"resumes bit-exact as far as {shown} steps show: a restored environment repeated each of the original's"
     )
@@ -116,12 +138,29 @@ class _Driver:
         self.ended = np.atleast_1d(np.logical_or(terminated, truncated))
         return [*seen, obs, reward, terminated, truncated]
 
-    def course(self, actions: list[Any] | None) -> list[Any]:
-        """The steps that are compared, then those after a reset, which draws from the environment's generator."""
-        given = iter(actions or ())
-        seen = [_frozen_copy(self.step(next(given, None))) for _ in range(NUM_STEPS_AFTER)]
-        seen.append(_frozen_copy(self.reset(None)))
-        return seen + [_frozen_copy(self.step(next(given, None))) for _ in range(NUM_STEPS_AFTER // 5)]
+    def run(self, num_steps: int, seconds: float) -> None:
+        """Steps before those that are compared."""
+        until = math.inf
+        for number in range(num_steps):
+            self.step(None)
+            until = time.monotonic() + seconds if number == 0 else until  # the first may have had to load kernels
+            if time.monotonic() > until:
+                break
+
+    def course(self, actions: list[Any] | None, seconds: float = math.inf) -> list[Any]:
+        """The steps that are compared, then those after a reset, which draws from the environment's generator.
+
+        Where the time is up it ends; with actions given it has as many steps as there are.
+        """
+        seen: list[Any] = []
+        until = time.monotonic() + seconds
+        for number in range(NUM_STEPS_AFTER + NUM_STEPS_AFTER // 5 if actions is None else len(actions)):
+            if number == NUM_STEPS_AFTER:
+                seen.append(_frozen_copy(self.reset(None)))
+            seen.append(_frozen_copy(self.step(None if actions is None else actions[number])))
+            if time.monotonic() > until:
+                break
+        return seen
 
     def _remember_masks(self, obs: Any, extra: dict[str, Any]) -> None:
         self.masks = extra.get("action_mask", obs.get("action_mask") if isinstance(obs, dict) else None)

@@ -82,7 +82,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path = self.named = path
         self.config: dict[str, Any] = {}
         """The effective configuration, as ``config.json`` has it."""
         self.free: frozenset[str] = frozenset()

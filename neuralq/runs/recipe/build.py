@@ -5,6 +5,7 @@ What a learner needs is asked of its record (`neuralq.learners.LearnerKind`); no
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import importlib
 import warnings
@@ -15,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
@@ -25,7 +26,8 @@ from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
-from neuralq.runs.folder.env_probe import is_resumable
+from neuralq.runs.evaluation import MOST_STEPS
+from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
@@ -37,7 +39,16 @@ from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, R
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
-__all__ = ["build_q", "build_session", "engine_name", "make_envs", "normalisation_for", "plan_of"]
+__all__ = [
+    "build_q",
+    "build_session",
+    "engine_name",
+    "has_time_limit",
+    "make_envs",
+    "make_evaluation_envs",
+    "normalisation_for",
+    "plan_of",
+]
 
 _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]] = {
     "action-input": ActionInputQ,
@@ -182,8 +193,44 @@ def build_session(config: RunConfig) -> Session:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
     _check_device(config.device)
-    settings, num_envs = config.settings, _num_envs(config)
-    envs = make_envs(config, num_envs, training=True)
+    envs = make_envs(config, _num_envs(config), training=True)
+    try:
+        return _session(config, envs)
+    except BaseException:
+        with contextlib.suppress(Exception):
+            envs.close()
+        raise
+
+
+def make_evaluation_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    """As many environments as there are episodes, or one where there cannot be so many at a time.
+
+    Raises:
+        ValueError: if there cannot be even one.
+    """
+    try:
+        return make_envs(config, num_envs)
+    except ValueError:
+        if num_envs == 1:
+            raise
+        return make_envs(config, 1)
+
+
+def has_time_limit(envs: VectorEnv[Any, Any, Any]) -> bool:
+    """Whether Gymnasium, or the environment's own vectorised implementation, ends every episode some time.
+
+    Example:
+        >>> has_time_limit(make_envs(RunConfig(), 2)), has_time_limit(make_envs(RunConfig(env="CliffWalking-v1"), 1))
+        (True, False)
+    """
+    inner = envs.unwrapped
+    spec = inner.envs[0].spec if isinstance(inner, SyncVectorEnv) else inner.spec
+    limit = None if spec is None else spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
+    return limit is not None and limit > 0
+
+
+def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
+    settings = config.settings
     as_index = config.layout == "table"
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
@@ -194,19 +241,34 @@ def build_session(config: RunConfig) -> Session:
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
-    evaluation_envs = make_envs(config, config.evaluation_episodes)
     frozen = None if normalisation is None else normalisation.frozen()
-    evaluation = Interaction(evaluation_envs, config.gamma, seed_for(config.seed, 4), as_index, frozen)
-    probe = is_resumable(
-        lambda: make_envs(config, num_envs, training=True),
+    probe = _probe(config, envs)
+    _warm(config, engine, stream)
+    cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
+    return Session(
+        stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
+        config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+    )  # fmt: skip
+
+
+def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
+    envs = make_evaluation_envs(config, config.evaluation_episodes)
+    try:
+        return Interaction(envs, config.gamma, seed_for(config.seed, 4), config.layout == "table", frozen)
+    except BaseException:
+        envs.close()
+        raise
+
+
+def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
+    if not config.resume_probe:
+        return untried(envs)
+    return is_resumable(
+        lambda: make_envs(config, _num_envs(config), training=True),
         seed_for(config.seed, 5),
         np.random.default_rng(seed_for(config.seed, 6)),
+        PROBE_SECONDS,
     )
-    _warm(config, engine, stream)
-    return Session(
-        stream, policy, experience, learner, generators, evaluation, probe,
-        config.seed, config.evaluation_episodes, config.evaluation_max_steps, config.reward_scale,
-    )  # fmt: skip
 
 
 def engine_name(learner: Learner) -> str:

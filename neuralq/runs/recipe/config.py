@@ -68,7 +68,9 @@ class RunConfig:
         dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
-        evaluation_max_steps: where the environment has no time limit, steps after which an evaluation episode is cut.
+        evaluation_max_steps: steps after which an evaluation episode is cut; None for 10,000, and where the environment
+            has no time limit for ten times the longest episode of training.
+        resume_probe: whether it is tried, for a second at most, if the environment's state can be saved and put back.
         checkpoint_every: environment steps between checkpoints.
         log_every: environment steps between rows of training metrics.
         engine: "auto", "torch" or "compiled".
@@ -102,7 +104,8 @@ class RunConfig:
         learners: None
     evaluate_every: int = 4096
     evaluation_episodes: int = 20
-    evaluation_max_steps: int = 10_000
+    evaluation_max_steps: int | None = None
+    resume_probe: bool = True
     checkpoint_every: int = 50_000
     log_every: int = 1024
     engine: str = "auto"
@@ -128,13 +131,14 @@ class RunConfig:
             "total_steps",
             "evaluate_every",
             "evaluation_episodes",
-            "evaluation_max_steps",
             "checkpoint_every",
             "log_every",
             "threads",
             "epsilon_decay_steps",
         ):
             check_whole(name, getattr(self, name))
+        if self.evaluation_max_steps is not None:
+            check_whole("evaluation_max_steps", self.evaluation_max_steps)
         for name, kind in LEARNERS.items():
             given = getattr(self, name)
             if name == self.learner and given is None:

@@ -83,8 +83,9 @@ def refusals_name(env: str) -> Iterator[None]:
             known = ", ".join(id.removeprefix("neuralq/") for id in neuralq_envs.ENVIRONMENTS)
             way_out = f"neuralq has {known}; elsewhere they are found as 'neuralq_envs:neuralq/MitchellGrid-v0'"
         raise ValueError(f"cannot make the environment {env!r}: {str(error).rstrip('.')}. {way_out}") from error
-    except Exception as error:  # the environment's own code ran
-        raise ValueError(f"cannot make the environment {env!r}: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:  # the environment's own code ran
+        notes = "".join(f"; {note}" for note in getattr(error, "__notes__", ()))
+        raise ValueError(f"cannot make the environment {env!r}: {type(error).__name__}: {error}{notes}") from error
 
 
 def make_single(
@@ -116,9 +117,13 @@ def make_single(
         return gym.make(env, **kwargs)
     frame_skip = kwargs.pop("frameskip", _FRAME_SKIP)
     game = gym.make(env, frameskip=1, **kwargs)
-    frames = AtariPreprocessing(
-        game, noop_max=_NUM_NOOPS, frame_skip=frame_skip, screen_size=_SIDE, terminal_on_life_loss=end_on_life_loss
-    )
+    try:
+        frames = AtariPreprocessing(
+            game, noop_max=_NUM_NOOPS, frame_skip=frame_skip, screen_size=_SIDE, terminal_on_life_loss=end_on_life_loss
+        )
+    except BaseException:
+        game.close()
+        raise
     stacked = FrameStackObservation(frames, _NUM_STACKED)
     return ClipReward(stacked, -1.0, 1.0) if clip_rewards else stacked
 

@@ -173,7 +173,7 @@ class Interaction:
         """
         try:
             observation, info = self.envs.reset(seed=seed)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._fault(f"at reset, {_describe_error(error)}") from error
         self._pending[:] = False
         self._returns[:] = 0
@@ -193,9 +193,12 @@ class Interaction:
 
     def _encoded(self, observation: Any) -> Array:
         try:
-            return self.encoder.encode(observation)
+            encoded = self.encoder.encode(observation)
         except ObservationError as error:
             raise self._fault(str(error)) from error
+        if len(encoded) != self.num_envs:
+            raise self._fault(f"field observation: must have {self.num_envs} rows, got {len(encoded)}")
+        return encoded
 
     def _normalised(self, encoded: Array, env_indices: Array) -> Array:
         return encoded if self.normalisation is None else self.normalisation.observe(encoded, env_indices)
@@ -258,8 +261,9 @@ class Interaction:
         chosen, mu = _act(policy, self._s)
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._fault(_describe_error(error)) from error
+        terminated, truncated = self._flags("terminated", terminated), self._flags("truncated", truncated)
         last = terminated | truncated
         r_t = self._checked_reward(reward)
         ended = np.count_nonzero(last) > 0  # four times as quick as last.any(), here at every step
@@ -286,6 +290,18 @@ class Interaction:
         if not (self.mode is AutoresetMode.DISABLED and episodes):
             self._s = arrived
         return Step(rows, env_indices, episodes)
+
+    def _flags(self, field: str, value: Any) -> Array:
+        """Which episodes have ended, ``[N]`` bool; what is neither yes nor no would be cast to either."""
+        if type(value) is np.ndarray and value.dtype == bool and value.shape == (self.num_envs,):
+            return value
+        found = np.asarray(value)
+        if found.shape != (self.num_envs,):
+            raise self._fault(f"field {field}: must have shape ({self.num_envs},), got {found.shape}")
+        for env_index, one in enumerate(found.tolist()):
+            if one not in (0, 1):
+                raise self._fault_in(env_index, f"{field}: must be true or false, got {one!r}")
+        return found.astype(bool)
 
     def _checked_reward(self, reward: Any) -> Array:
         try:
@@ -338,7 +354,7 @@ class Interaction:
         if self.mode is AutoresetMode.DISABLED:
             try:
                 observation, info = self.envs.reset(options={"reset_mask": last})
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise self._fault(_describe_error(error)) from error
             fresh = self._observe(observation, info, ended)
             self._s = arrived.copy()
@@ -391,9 +407,11 @@ def _act(policy: Policy, s: Array) -> tuple[Array, Array]:
     return action.numpy(), mu.numpy()
 
 
-def _describe_error(error: Exception) -> str:
+def _describe_error(error: BaseException) -> str:
     if isinstance(error, SubEnvFault | ObservationError):
         return str(error)
+    if isinstance(error, SystemExit):
+        return f"an environment called sys.exit({'' if error.code is None else repr(error.code)})"
     return f"an environment raised {type(error).__name__}: {error}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -47,6 +48,9 @@ def _mask_method(env: gym.Env[Any, Any]) -> Callable[[], Any] | None:
     return None
 
 
+_FLAGS = (bool, np.bool_)
+
+
 class SubEnvFault(RuntimeError):
     """An environment of a batch raised; the message names its index."""
 
@@ -79,32 +83,45 @@ class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
         """As the environment's own, with a copied observation and the reward as a float."""
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._raised(error) from error
         try:
             r_t = float(reward)
         except Exception as error:
             raise SubEnvFault(self.index, f": reward must be a number, got {reward!r}") from error
+        if type(terminated) not in _FLAGS or type(truncated) not in _FLAGS:
+            terminated, truncated = self._flag("terminated", terminated), self._flag("truncated", truncated)
         return self._checked(observation), r_t, terminated, truncated, self._with_mask(info)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """As the environment's own, with a copied observation."""
         try:
             observation, info = self.env.reset(seed=seed, options=options)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._raised(error) from error
         return self._checked(observation), self._with_mask(info)
 
     def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
         """What the environment says of its legal actions where ``info`` looks for it; ``info`` wins if both speak."""
+        if not isinstance(info, dict):
+            raise SubEnvFault(self.index, f": info must be a mapping, got {info!r}")
         if self._mask_method is None or "action_mask" in info:
             return info
         try:
             return {**info, "action_mask": np.asarray(self._mask_method())}
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._raised(error) from error
 
-    def _raised(self, error: Exception) -> SubEnvFault:
+    def _flag(self, field: str, value: Any) -> bool:
+        """Whether an episode has ended; what is neither yes nor no would be cast to either without a word."""
+        found = np.asarray(value)
+        if found.size == 1 and found.dtype.kind in "biuf" and found.reshape(-1)[0] in (0, 1):
+            return bool(found.reshape(-1)[0])
+        raise SubEnvFault(self.index, f": {field} must be true or false, got {value!r}")
+
+    def _raised(self, error: Exception | SystemExit) -> SubEnvFault:
+        if isinstance(error, SystemExit):
+            return SubEnvFault(self.index, f" called sys.exit({'' if error.code is None else repr(error.code)})")
         return SubEnvFault(self.index, f" raised {type(error).__name__}: {error}")
 
     def _checked(self, observation: Any) -> Any:
@@ -138,10 +155,18 @@ def make_vector_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> Syn
         2
     """
     check_whole("num_envs", num_envs)
-    return SyncVectorEnv(
-        [partial(_sub_env, make, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
-    )
-
-
-def _sub_env(make: Callable[[], gym.Env[Any, Any]], index: int) -> SubEnv:
-    return SubEnv(make(), index)
+    made: list[gym.Env[Any, Any]] = []
+    try:
+        for index in range(num_envs):
+            made.append(make())
+            made[-1] = SubEnv(made[-1], index)
+        return SyncVectorEnv(
+            [partial(made.__getitem__, i) for i in range(num_envs)], copy=False, autoreset_mode=AutoresetMode.DISABLED
+        )
+    except BaseException as error:
+        for env in made:
+            with contextlib.suppress(Exception):
+                env.close()
+        if 0 < len(made) < num_envs and isinstance(error, Exception):
+            error.add_note(f"{len(made)} of {num_envs} were made before; there may have to be fewer at a time")
+        raise

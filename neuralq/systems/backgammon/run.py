@@ -170,7 +170,7 @@ def _result(config: TdGammonConfig, trainee: _Trainee, progress: Progress, folde
     with replacing(folder.path / WEIGHTS_NAME) as temporary:
         network.save(temporary, notes)
     return GammonRun(
-        run_dir=folder.path,
+        run_dir=folder.named,
         games=trainee.amount,
         env_steps=trainee.env_steps,
         cpu_seconds=progress.cpu_seconds,
