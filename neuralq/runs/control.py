@@ -25,6 +25,7 @@ from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import Progress, seed_for
 from neuralq.runs.recipe.build import build_q, build_session, engine_name, make_envs, normalisation_for, plan_of
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
@@ -145,6 +146,11 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
             envs.close()
 
 
+def _opening(config: RunConfig, session: Session) -> list[str]:
+    warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
+    return [*opening_lines(session.stream), *warned]
+
+
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     exploration = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     notes = [f"ε {exploration.value(latest['env_steps']):.3g}"]
@@ -173,5 +179,5 @@ CONTROL = Kind(
     result=_result,
     load=_load_agent,
     notes=_notes,
-    opening=lambda session: opening_lines(session.stream),
+    opening=_opening,
 )

@@ -26,6 +26,7 @@ from neuralq.runs.folder.env_probe import is_resumable
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
+from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
@@ -150,6 +151,7 @@ def build_session(config: RunConfig) -> Session:
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
+    require_room(config, stream.spec)
     engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(settings), config.engine)
     learner = _learner(config, engine, stream.spec, generators["samples"])
     experience = _SOURCES[config.kind.experience](settings, stream.spec, generators["samples"])
@@ -168,7 +170,13 @@ def build_session(config: RunConfig) -> Session:
     return Session(
         stream, policy, experience, learner, generators, evaluation, probe,
         config.seed, config.evaluation_episodes, config.evaluation_max_steps, config.reward_scale,
+        _value_range(settings),
     )  # fmt: skip
+
+
+def _value_range(settings: Any) -> tuple[float, float] | None:
+    low, high = getattr(settings, "value_min", None), getattr(settings, "value_max", None)
+    return None if low is None or high is None else (low, high)
 
 
 def engine_name(learner: Learner) -> str:
