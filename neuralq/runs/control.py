@@ -17,7 +17,7 @@ from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
 from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy, shown
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
@@ -68,7 +68,7 @@ class Run:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        score = "not evaluated" if self.greedy_return is None else f"greedy return {self.greedy_return:.1f}"
+        score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
         return [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}"
@@ -154,14 +154,14 @@ def _opening(config: RunConfig, session: Session) -> list[str]:
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     exploration = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     notes = [f"ε {exploration.value(latest['env_steps']):.3g}"]
-    for name, shown in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
+    for name, label in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
         if name in latest:
-            notes.append(f"{shown} {latest[name]:.3g}")
+            notes.append(f"{label} {latest[name]:.3g}")
     if "episode_return" in latest:
-        notes.append(f"return {latest['episode_return']:.1f}")
+        notes.append(f"return {shown(latest['episode_return'])}")
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
-        notes.append(f"greedy {latest['greedy_return']:.1f}{goal}")
+        notes.append(f"greedy {shown(latest['greedy_return'])}{goal}")
     return notes
 
 

@@ -9,6 +9,7 @@ import difflib
 import importlib
 import itertools
 import json
+import re
 import sys
 import traceback
 import warnings
@@ -97,8 +98,9 @@ def print_result(result: dict[str, Any], as_json: bool, lines: Sequence[str]) ->
 def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
 ) -> None:
-    """A warning for whoever typed the command: what it says, not where in the code."""
-    print(f"neuralq: warning: {message}", file=sys.stderr)
+    """A warning for whoever typed the command: what it says, not where in the code, nor in which colour."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(message)).removeprefix("WARN: ")  # as Gymnasium writes its own
+    print(f"neuralq: warning: {text}", file=sys.stderr)
 
 
 class _Asked(Exception):

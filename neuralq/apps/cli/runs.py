@@ -16,6 +16,7 @@ from neuralq.apps.cli.sweeps import resume_seeds, single_run, started_from, trai
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
+from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import default_run_path, read_config, refuse_old_run
@@ -144,7 +145,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     best = _best_return(run)
     notes = []
     if best is not None and run.greedy_return is not None and best > run.greedy_return:
-        notes.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
+        notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
         raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
