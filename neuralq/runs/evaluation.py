@@ -63,14 +63,14 @@ class Evaluation:
         return lines
 
 
-def shown(value: float) -> str:
-    """A return for people: one decimal, or three where returns lie within ±1.
+def shown(value: float, places: int = 1) -> str:
+    """A return for people: so many decimals, and two more where returns lie within ±1.
 
     Example:
         >>> shown(20.24), shown(0.9731)
         ('20.2', '0.973')
     """
-    return f"{value:.{1 + _more_places([value])}f}"
+    return f"{value:.{places + _more_places([value])}f}"
 
 
 def _more_places(returns: Sequence[float]) -> int:

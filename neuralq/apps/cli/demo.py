@@ -72,7 +72,7 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
     with training_bar(CONTROL, config) as bar:
         run = train(config, path, [bar])
     console.print(
-        f"   greedy return {shown(run.greedy_return)} over 20 episodes after {run.env_steps:,} steps: "
+        f"   greedy return {shown(run.greedy_return or 0.0)} over 20 episodes after {run.env_steps:,} steps: "
         f"{run.cpu_seconds:.2f} CPU-seconds of training, {run.wall_seconds:.1f} s with evaluation",
         highlight=False,
         soft_wrap=True,

@@ -147,9 +147,9 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
             lines.append(f"seed {run.seed}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
     found = result.estimate
     if found is not None:
-        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {shown(found.iqm)}"
+        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {shown(found.iqm, 2)}"
         if found.low is not None and found.high is not None:
-            text += f", 95 % interval {shown(found.low)} to {shown(found.high)} (stratified bootstrap)"
+            text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
         lines.append(text)
     return [*lines, f"sweep folder {sweep.path}"]
 
