@@ -6,9 +6,10 @@ its `Progress`; a checkpoint holds exactly the first and the last, so a run that
 
 from __future__ import annotations
 
+import logging
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
@@ -29,9 +30,11 @@ __all__ = [
     "Observer",
     "Plan",
     "Progress",
+    "Speaks",
     "Trainee",
     "continued",
     "fit",
+    "say_to",
     "seed_for",
 ]
 
@@ -70,6 +73,22 @@ class Listener(Protocol):
     def say(self, line: str, /) -> None:
         """Take in one line."""
         ...
+
+
+@runtime_checkable
+class Speaks(Protocol):
+    """A trainee that may have something to say while it trains; it is given ``say``."""
+
+    say: Callable[[str], None]
+
+
+def say_to(hooks: Sequence[Hook], line: str) -> None:
+    """A line to every hook that listens; a warning that nobody listens to goes to the log ``neuralq``."""
+    listeners = [hook for hook in hooks if isinstance(hook, Listener)]
+    for listener in listeners:
+        listener.say(line)
+    if not listeners and line.startswith("warning: "):
+        logging.getLogger("neuralq").warning(line.removeprefix("warning: "))
 
 
 class Diverged(RuntimeError):

@@ -22,6 +22,7 @@ from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Interaction, Policy
+from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.experience import ExperienceSource, Sample
 
 __all__ = ["Session", "cap_on_evaluation"]
@@ -44,6 +45,7 @@ class Session:
         evaluation_max_steps: bound on an evaluation episode where the environment has none; None to learn one from
             the episodes of training (`cap_on_evaluation`).
         evaluate_every: environment steps between evaluations.
+        value_range: the smallest and the largest return that the learner can represent, where it cannot represent all.
         reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
     """
 
@@ -59,12 +61,23 @@ class Session:
     evaluation_max_steps: int | None
     evaluate_every: int
     reward_scale: float = 1.0
+    value_range: tuple[float, float] | None = None
     _evaluation: Interaction | None = field(init=False, default=None)
     _cannot_evaluate: bool = field(init=False, default=False)
     _longest: int = field(init=False, default=0)
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
+    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    _early: EarlyReturns | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        """Watch the first returns where some of them cannot be represented."""
+        if self.value_range is not None:
+            stream = self.stream
+            self._early = EarlyReturns(
+                *self.value_range, stream.discount, stream.num_envs, lambda line: self.say(f"warning: {line}")
+            )
 
     @property
     def evaluation_stream(self) -> Interaction:
@@ -100,6 +113,8 @@ class Session:
         while True:
             step = stream.step(self.policy)
             experience.add(step)
+            if self._early is not None:
+                self._early = self._early.add(step)
             for episode in step.episodes:
                 self._recent_returns.append(episode.episode_return)
                 self._longest = max(self._longest, episode.length)

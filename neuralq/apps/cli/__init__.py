@@ -10,6 +10,7 @@ import importlib
 import itertools
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -104,8 +105,9 @@ _output: contextvars.ContextVar[TextIO | None] = contextvars.ContextVar("_output
 def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
 ) -> None:
-    """A warning for whoever typed the command: what it says, not where in the code."""
-    print(f"neuralq: warning: {message}", file=sys.stderr)
+    """A warning for whoever typed the command: what it says, not where in the code, nor in which colour."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(message)).removeprefix("WARN: ")  # as Gymnasium writes its own
+    print(f"neuralq: warning: {text}", file=sys.stderr)
 
 
 class _Asked(Exception):

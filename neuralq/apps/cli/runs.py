@@ -16,7 +16,7 @@ from neuralq.apps.cli.sweeps import resume_seeds, single_run, started_from, trai
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
-from neuralq.runs.evaluation import MOST_STEPS
+from neuralq.runs.evaluation import MOST_STEPS, shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
@@ -164,7 +164,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     best = _best_return(run)
     notes = []
     if best is not None and run.greedy_return is not None and best > run.greedy_return:
-        notes.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
+        notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     if (cut := _cut(run)) is not None:
         notes.append(cut)
     status = conclude(run, as_json, notes, best_return=best, report=report_path)

@@ -31,6 +31,7 @@ from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resuma
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
+from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
@@ -235,6 +236,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
+    require_room(config, stream.spec)
     engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(settings), config.engine)
     learner = _learner(config, engine, stream.spec, generators["samples"])
     experience = _SOURCES[config.kind.experience](settings, stream.spec, generators["samples"])
@@ -248,6 +250,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+        _value_range(config.settings),
     )  # fmt: skip
 
 
@@ -269,6 +272,11 @@ def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
         np.random.default_rng(seed_for(config.seed, 6)),
         PROBE_SECONDS,
     )
+
+
+def _value_range(settings: Any) -> tuple[float, float] | None:
+    low, high = getattr(settings, "value_min", None), getattr(settings, "value_max", None)
+    return None if low is None or high is None else (low, high)
 
 
 def engine_name(learner: Learner) -> str:
