@@ -64,7 +64,12 @@ def own_hook(name: str) -> Callable[[Mapping[str, Any]], None]:
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"cannot import the hook {name!r}: {error}; name it as 'module:function'") from error
-    hook = found() if isinstance(found, type) else found
+    except (Exception, SystemExit) as error:  # the user's own code ran
+        raise ValueError(f"cannot import the hook {name!r}: it raised {type(error).__name__}: {error}") from error
+    try:
+        hook = found() if isinstance(found, type) else found
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"cannot make the hook {name!r}: it raised {type(error).__name__}: {error}") from error
     if not callable(hook):
         raise ValueError(f"the hook {name!r} must take a row of metrics when called, got {hook!r}")
     return cast(Callable[[Mapping[str, Any]], None], hook)

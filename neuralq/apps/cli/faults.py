@@ -5,7 +5,7 @@ from __future__ import annotations
 from neuralq.checks import MissingExtra
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import RunFolderError
-from neuralq.runs.loop import Diverged
+from neuralq.runs.loop import Diverged, HookFault
 from neuralq.runs.stream import EnvironmentFault
 
 __all__ = ["USER_FAULTS"]
@@ -14,6 +14,7 @@ USER_FAULTS = (
     CheckpointError,
     Diverged,
     EnvironmentFault,
+    HookFault,
     MemoryError,
     MissingExtra,
     OSError,
