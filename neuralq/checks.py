@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "MOST_WHOLE",
     "MissingExtra",
     "available_bytes",
     "check_choice",
@@ -19,6 +20,10 @@ __all__ = [
     "check_positive",
     "check_whole",
 ]
+
+
+MOST_WHOLE = 2**128
+"""Whole numbers stay below this: seeds of 128 bits are the longest that anybody draws."""
 
 
 class MissingExtra(ImportError):
@@ -80,6 +85,8 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     Raises:
         ValueError: otherwise.
     """
+    if type(value) is int and abs(value) >= MOST_WHOLE:  # beyond any use, and 10^309 is beyond any float
+        raise ValueError(f"{name} must be a whole number below 2^128, got one of {value.bit_length():,} bits")
     if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < minimum:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 

@@ -1,7 +1,8 @@
 """Run folders that somebody else made or a disk has changed: nothing elsewhere is touched, no wrong value believed.
 
 Mutants that must die here: a link followed when writing, a hard link emptied, a pipe waited for, a temporary name that
-can be foreseen, a changed digit shown, a lost row not missed, nesting without a bound.
+can be foreseen, a changed digit shown, a lost row not missed, nesting without a bound, a folder outside the sweep
+written to, a stranger's module imported.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -17,13 +19,16 @@ from typing import Any
 import pytest
 import torch
 
-from neuralq.runs import RunConfig, resume, train
+from neuralq.apps.cli import main
+from neuralq.learners import RolloutSettings
+from neuralq.runs import RunConfig, load, resume, train
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.files import FolderLock, RunFolderError, read_json, read_rows, replacing, row_line
 from neuralq.runs.folder.run_folder import RunFolder, read_config, read_metrics, read_seed, read_summary
 from neuralq.runs.hooks import WeightsAndBiases
 from neuralq.runs.report.page import Page
-from neuralq.runs.sweep import create_sweep, run_sweep
+from neuralq.runs.sweep import create_sweep, open_sweep, run_sweep
+from neuralq.runs.trust import refuse_strangers
 
 PRECIOUS = "what must not be touched\n"
 
@@ -46,7 +51,8 @@ def a_run(path: Path, num_rows: int = 3) -> Path:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = RunConfig(total_steps=64, evaluate_every=64, evaluation_episodes=1, log_every=32, seed=5)
+    rollout = RolloutSettings(num_envs=2, num_steps=16)
+    config = RunConfig(total_steps=64, evaluate_every=64, evaluation_episodes=1, log_every=32, rollout=rollout)
     return train(config, tmp_path_factory.mktemp("short") / "run").run_dir
 
 
@@ -83,6 +89,7 @@ def test_no_row_is_appended_and_no_line_cut_through_a_link(kind: str, tmp_path: 
 def test_replaced_files_go_through_no_link_and_their_temporary_names_cannot_be_foreseen(
     tmp_path: Path, precious: Path
 ) -> None:
+    precious.write_text(written := '{"env": "CartPole-v1"}\n')
     path = a_run(tmp_path / "run")
     for name in (".config.json.tmp", ".summary.json.tmp", ".report.html.partial", ".partial-weights.safetensors"):
         os.symlink(precious, path / name)
@@ -92,7 +99,7 @@ def test_replaced_files_go_through_no_link_and_their_temporary_names_cannot_be_f
         folder.replace_config({"env": "other"})
         folder.write_summary({"env_steps": 1})
     Page("a title").write(path / "report.html")
-    assert precious.read_text() == PRECIOUS
+    assert precious.read_text() == written
     assert read_config(path) == {"env": "other"} and read_summary(path) == {"env_steps": 1}
     names = set()
     for _ in range(2):
@@ -217,7 +224,7 @@ def test_lost_rows_are_missed_by_whoever_reads_and_by_the_run_that_goes_on(tmp_p
     (copy / "metrics.jsonl").write_text("")
     (copy / "summary.json").unlink()
     with pytest.warns(UserWarning, match="has lost rows"):
-        resume(copy, total_steps=96)
+        resume(copy, total_steps=256)
 
 
 @pytest.mark.parametrize("name", ["config.json", "run.json", "summary.json", "metrics.jsonl"])
@@ -268,3 +275,184 @@ def test_what_a_killed_writer_left_is_cleared_by_the_next_one(tmp_path: Path) ->
     assert json.loads((path / "summary.json").read_bytes())["num_rows"] == 3 and "crc32" not in read_json(
         path / "summary.json"
     )
+
+
+# Sweeps
+
+
+@pytest.fixture
+def sweep_of_others(tmp_path: Path) -> Path:
+    config = {"env": "CartPole-v1", "total_steps": 100, "threads": 1}
+    return create_sweep(tmp_path / "sweep", config, [0, 1], ["--tensorboard", "--hook", "my_hooks:Log"]).path
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"seeds": ["0/../../x"]}, "seed must be a whole number, got '0/../../x'"),
+        ({"seeds": [0.5]}, "seed must be a whole number, got 0.5"),
+        ({"seeds": [True]}, "seed must be a whole number of at least 0, got True"),
+        ({"seeds": [-1]}, "seed must be a whole number of at least 0, got -1"),
+        ({"seeds": [10**400]}, "seed must be a whole number below 2^128, got one of 1,329 bits"),  # 400 log2(10)
+        ({"seeds": []}, "a sweep needs one seed or more"),
+        ({"seeds": {"0": 1}}, "a sweep needs one seed or more"),
+        ({"options": ["--run-dir", "/elsewhere"]}, "its options hold '--run-dir'"),
+        ({"options": ["--hook", "a:b", "--run-dir=/x"]}, "its options hold '--hook'"),
+        ({"options": ["--hook"]}, "its options hold '--hook'"),
+        ({"options": ["--hook", "--config=x:y"]}, "its options hold '--hook'"),
+        ({"options": "--tensorboard"}, "its options must be a list"),
+        ({"options": [5]}, "its options hold 5"),
+        ({"version": "newest"}, "cannot be read"),
+    ],
+)
+def test_a_sweep_names_whole_numbers_and_its_own_options_or_is_refused(
+    changes: dict[str, Any], told: str, sweep_of_others: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert open_sweep(sweep_of_others).options == ("--tensorboard", "--hook", "my_hooks:Log")
+    file = sweep_of_others / "sweep.json"
+    file.write_text(json.dumps(read_json(file) | changes))
+    for command in ("resume", "evaluate", "report", "compare"):
+        assert main([command, str(sweep_of_others)]) == 1
+        assert told in (error := capsys.readouterr().err) and error.count("\n") == 1
+    assert sorted(p.name for p in sweep_of_others.parent.iterdir()) == ["sweep"]
+
+
+@pytest.mark.parametrize("content", ["5", "{}", '{"total_steps": "many"}', '{"total_steps": 5, "threads": "x"}', "["])
+def test_the_configuration_of_a_sweep_is_one_or_is_refused(
+    content: str, sweep_of_others: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (sweep_of_others / "config.json").write_text(content)
+    assert main(["resume", str(sweep_of_others)]) == 1
+    assert (error := capsys.readouterr().err).startswith("neuralq: error: the sweep in") and error.count("\n") == 1
+
+
+def test_a_changed_bit_of_a_sweep_is_noticed(sweep_of_others: Path) -> None:
+    file = sweep_of_others / "sweep.json"
+    written, right = file.read_bytes(), open_sweep(sweep_of_others)
+    for at in random.Random(2).sample(range(8 * len(written)), 300):
+        changed = bytearray(written)
+        changed[at // 8] ^= 1 << at % 8
+        file.write_bytes(changed)
+        try:
+            found = open_sweep(sweep_of_others)
+        except RunFolderError:
+            continue
+        assert (found.seeds, found.options) == (right.seeds, right.options)
+
+
+# Configurations
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"learner": "replay"}, {"learner": "replay", "rollout": None}, {"learner": ["x"]}, {"rollout": {1: 2}},
+        {"rollout": [1]}, {"seed": 10**400}, {"total_steps": 10**400}, {"gamma": 10**400}, {"stop_at_return": 10**400},
+        {"threads": 10**9}, {"body": {"class": ["MLP"]}}, {"env": 5}, {"env_kwargs": [1]},
+        {"env_kwargs": {"no": 1}}, {"kind": ["x"]}, {"kind": "control"}, {"device": "\x00"}, {"engine": [1]},
+        {"rollout": {"num_envs": 10**12}}, {"rollout": {"num_steps": 2**70}},
+    ],
+)  # fmt: skip
+def test_an_absurd_configuration_is_one_error_in_every_command(
+    changes: dict[str, Any], short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(short, tmp_path / "run"))
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | changes))
+    for command in (["resume", str(run), "--total-steps", "96"], ["evaluate", str(run), "--episodes", "1"]):
+        status = main(command)
+        error = capsys.readouterr().err
+        assert "Traceback" not in error
+        if status != 0:  # evaluating asks for less than training does
+            assert status in (1, 2) and error.startswith("neuralq: ") and error.count("\n") == 1
+        else:
+            assert command[0] == "evaluate"
+
+
+@pytest.mark.parametrize("number", ["9" * 400, "9" * 5000, "-" + "9" * 400])
+@pytest.mark.parametrize("option", ["--seed", "--total-steps", "--gamma", "--rollout.num-steps", "--seeds"])
+def test_a_number_of_hundreds_of_digits_is_wrong_usage(
+    option: str, number: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "CartPole-v1", f"{option}={number}"]) == 2
+    assert option[2:].replace("-", "_").split("_")[0] in capsys.readouterr().err.replace("-", "_")
+
+
+def test_a_run_whose_folder_is_not_named_in_utf_8_goes_on_and_is_read(short: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(short, tmp_path / os.fsdecode(b"r\xff")))
+    assert resume(path, total_steps=256).env_steps >= 256
+    assert load(path).predict([0.0, 0.0, 0.0, 0.0]) in (0, 1)
+
+
+# Hooks
+
+
+class Broken:
+    """A hook that raises where it is told to."""
+
+    where: str = ""
+
+    def __init__(self) -> None:
+        if self.where == "made":
+            raise LookupError("not made")
+
+    def __call__(self, row: Any) -> None:
+        if self.where == "called" and row["env_steps"] >= 32:
+            raise LookupError("lost the row")
+
+    def close(self) -> None:
+        raise LookupError("not closed")
+
+
+@pytest.mark.parametrize("where", ["made", "called", "closed"])
+def test_a_hook_that_raises_is_told_with_its_line_and_costs_no_training(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Broken, "where", where)
+    path = str(tmp_path / "run")
+    argv = ["train", "CartPole-v1", "--preset", "false", "--total-steps", "64", "--evaluation-episodes", "1"]
+    argv += ["--rollout.num-steps", "8", "--rollout.num-envs", "2", "--log-every", "16", "--resume-probe", "false"]
+    status = main([*argv, "--hook", f"{__name__}:Broken", "--run-dir", path])
+    error = capsys.readouterr().err
+    assert "Traceback" not in error and "LookupError" in error
+    if where == "made":
+        assert status == 1 and "cannot make the hook" in error and not Path(path).exists()
+    elif where == "closed":
+        assert status == 0 and "when it was closed: not closed" in error
+    else:
+        assert status == 1 and f"the hook Broken raised LookupError: lost the row ({__file__}, line " in error
+        assert re.search(r"the run is saved at \d+ env steps", error)
+        way_out = error[error.index("neuralq resume") :].split()[1:]
+        assert main([*way_out, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["env_steps"] >= 64
+
+
+# Trust
+
+
+@pytest.mark.parametrize("part", ["env", "body", "hook"])
+def test_without_trust_no_module_is_imported_that_is_no_installed_package(
+    part: str, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "planted.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    config = json.loads((short / "config.json").read_text())
+    for module in ("planted", "no_such_module", "os"):
+        named = {"env": {"env": f"{module}:My-v0"}, "body": {"body": {"class": "Custom", "module": f"{module}:Net"}}}
+        if part == "hook":
+            with pytest.raises(ValueError, match=rf"imports the module {module} \(its hook\)"):
+                refuse_strangers(config, f"{module}:Hook")
+            continue
+        run = Path(shutil.copytree(short, tmp_path / module))
+        (run / "config.json").write_text(json.dumps(config | named[part]))
+        for command in (["resume"], ["evaluate"], ["watch"], ["record", "--gif", "x.gif"], ["export", "--onnx", "x"]):
+            assert main([command[0], str(run), *command[1:], "--trust", "false"]) == 1
+            assert f"the run imports the module {module} (its" in capsys.readouterr().err
+    assert not (tmp_path / "ran").exists()
+
+
+def test_what_is_installed_is_trusted(short: Path, tmp_path: Path) -> None:
+    for env in ("CartPole-v1", "gymnasium.envs:CartPole-v1", "neuralq_envs:neuralq/MitchellGrid-v0"):
+        refuse_strangers({"env": env, "body": "mlp"})
+    run = Path(shutil.copytree(short, tmp_path / "run"))
+    assert main(["evaluate", str(run), "--episodes", "1", "--trust", "false", "--json"]) == 0

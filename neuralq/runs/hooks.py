@@ -66,14 +66,16 @@ def own_hook(name: str, config: Any = None) -> Callable[[Mapping[str, Any]], Non
         found: Any = importlib.import_module(place) if attribute else None
         for part in attribute.split("."):
             found = getattr(found, part)
-    except Exception as error:  # the module's own code ran
+    except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"cannot import the hook {name!r}: {error}; name it as 'module:function'") from error
+    except (Exception, SystemExit) as error:  # the user's own code ran
+        raise ValueError(f"cannot import the hook {name!r}: it raised {type(error).__name__}: {error}") from error
     hook = found
     if isinstance(found, type):
         try:
             hook = found.of(config) if hasattr(found, "of") else found()
-        except Exception as error:
-            raise ValueError(f"cannot make the hook {name!r}: {type(error).__name__}: {error}") from error
+        except (Exception, SystemExit) as error:
+            raise ValueError(f"cannot make the hook {name!r}: it raised {type(error).__name__}: {error}") from error
     if not callable(hook):
         raise ValueError(f"the hook {name!r} must take a row of metrics when called, got {hook!r}")
     return cast(Callable[[Mapping[str, Any]], None], hook)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -26,6 +27,7 @@ __all__ = [
     "NOT_EXACT",
     "Diverged",
     "Hook",
+    "HookFault",
     "Listener",
     "Observer",
     "Plan",
@@ -89,6 +91,10 @@ def say_to(hooks: Sequence[Hook], line: str) -> None:
         listener.say(line)
     if not listeners and line.startswith("warning: "):
         logging.getLogger("neuralq").warning(line.removeprefix("warning: "))
+
+
+class HookFault(RuntimeError):
+    """A hook raised; the run was saved where it stood."""
 
 
 class Diverged(RuntimeError):
@@ -254,6 +260,7 @@ def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hoo
     Raises:
         EnvironmentFault: if an environment breaks its contract. The last checkpoint stays as it is.
         Diverged: if the parameters stop being finite. Likewise.
+        HookFault: if a hook raises, once the run is saved.
     """
     loop = _Loop(trainee, plan, progress, folder, hooks)
     request = StopRequest()
@@ -263,9 +270,23 @@ def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hoo
         except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
             loop._book(training=False)
             loop.interrupted(request)
+        except HookFault as fault:
+            loop._save(request)
+            raise HookFault(
+                f"{fault}; the run is saved at {trainee.amount:,} {plan.unit.replace('_', ' ')}: mend the hook or "
+                f"leave it out, then neuralq resume {folder.named}"
+            ) from fault.__cause__
         except ValueError:  # NaN among the values: the policy notices before the next checkpoint would
             trainee.require_finite()
             raise
+
+
+def _told_of(hook: Hook, error: Exception) -> str:
+    """Which hook, what it raised, and where in its code."""
+    name = getattr(hook, "__qualname__", type(hook).__qualname__)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
+    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    return f"the hook {name} raised {type(error).__name__}: {error}{place}"
 
 
 class _Loop:
@@ -336,9 +357,12 @@ class _Loop:
         self.folder.append_metrics(row)
         observed = trainee.observed
         for hook in self.hooks:
-            if observed is not None and isinstance(hook, Observer):
-                hook.observe(*observed)
-            hook(row)
+            try:
+                if observed is not None and isinstance(hook, Observer):
+                    hook.observe(*observed)
+                hook(row)
+            except Exception as error:
+                raise HookFault(_told_of(hook, error)) from error
         self._book(training=False)  # whoever watches costs wall time only
 
     def _log(self) -> None:

@@ -17,7 +17,7 @@ import torch
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.export_network import ExportedNetwork, input_names, raw_inputs
-from neuralq.apps.cli.sweeps import single_run
+from neuralq.apps.cli.sweeps import add_trust, single_run
 from neuralq.checks import MissingExtra
 from neuralq.runs import RunConfig, load
 from neuralq.runs.agent import Agent
@@ -46,8 +46,9 @@ def export(argv: list[str]) -> int:
     parser.add_argument("run", help="run folder")
     parser.add_argument("--onnx", required=True, metavar="FILE", help="the file to write")
     parser.add_argument("--best", action="store_true", help="take the best parameters of the run, not the last")
+    add_trust(parser)
     options = parser.parse_args(argv)
-    path, out = single_run(options.run), Path(options.onnx)
+    path, out = single_run(options.run, options.trust), Path(options.onnx)
     if not out.absolute().parent.is_dir():
         raise Failure(f"there is no folder {out.parent}; make it first")
     config = config_from_dict(read_config(path))

@@ -19,7 +19,7 @@ import neuralq_envs
 from neuralq.checks import MissingExtra
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import RunFolderError
-from neuralq.runs.loop import Diverged
+from neuralq.runs.loop import Diverged, HookFault
 from neuralq.runs.stream import EnvironmentFault
 from neuralq.systems.backgammon.opponents import IllegalTurn
 
@@ -29,6 +29,7 @@ USER_FAULTS = (
     CheckpointError,
     Diverged,
     EnvironmentFault,
+    HookFault,
     IllegalTurn,
     MemoryError,
     MissingExtra,

@@ -15,7 +15,7 @@ import gymnasium as gym
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.film import caption, drawn, frame_rate, make_shown, picture, play, writers_for
 from neuralq.apps.cli.progress import ProgressBar, Told
-from neuralq.apps.cli.sweeps import single_run
+from neuralq.apps.cli.sweeps import add_trust, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.run_folder import read_config
@@ -35,7 +35,7 @@ def watch(argv: list[str]) -> int:
     )
     _add_options(parser, num_episodes=3)
     options = parser.parse_args(argv)
-    path = single_run(options.run)
+    path = single_run(options.run, options.trust)
     config = config_from_dict(read_config(path))
     agent = load(path, options.best)  # imports the module that registers the environment, too
     mode = _shown_mode(config, path)
@@ -73,7 +73,7 @@ def record(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     if (options.fps is not None and not 0 < options.fps <= 1000) or not 16 <= options.width <= 4096:
         raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
-    path = single_run(options.run)
+    path = single_run(options.run, options.trust)
     config = config_from_dict(read_config(path))
     agent = load(path, options.best)
     _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
@@ -101,6 +101,7 @@ def _add_options(parser: argparse.ArgumentParser, num_episodes: int) -> None:
     add("--episodes", type=int, default=num_episodes, metavar="N", help=f"how many (default: {num_episodes})")
     add("--seed", type=int, default=0, metavar="N", help="of the episodes (default: 0)")
     add("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add_trust(parser)
     add("--max-steps", type=int, metavar="N", help="cut an episode after so many (default: as in evaluations)")
 
 

@@ -12,7 +12,7 @@ from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
-from neuralq.apps.cli.sweeps import resume_seeds, single_run, started_from, train_seeds
+from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
@@ -69,6 +69,7 @@ def resume(argv: list[str]) -> int:
     )
     parser.add_argument("--workers", type=int, metavar="N", help="of a sweep: how many seeds at a time")
     parser.add_argument("--hook", metavar="module:name", help="of a run on an environment: as for neuralq train")
+    add_trust(parser)
     options = parser.parse_args(argv)
     kind = kind_in(options.run)
     if kind not in (None, "control"):
@@ -78,10 +79,10 @@ def resume(argv: list[str]) -> int:
     if is_sweep_folder(options.run):
         if options.hook is not None:
             raise Failure("a sweep goes on with the hook that it was begun with; leave --hook out", 2)
-        return resume_seeds(options.run, total_steps, options.workers, options.json, changes)
+        return resume_seeds(options.run, total_steps, options.workers, options.json, changes, options.trust)
     if options.workers is not None:
         raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
-    path = Path(options.run)
+    path = single_run(options.run, options.trust)
     planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
     board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
     with _hooks(path, planned, board, tracker, options.hook) as hooks:
@@ -114,8 +115,16 @@ def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: s
         for make in wanted:
             hooks.append(make())
             if callable(close := getattr(hooks[-1], "close", None)):
-                stack.callback(close)
+                stack.callback(_end, close, hooks[-1])
         yield [*hooks, stack.enter_context(training_bar(CONTROL, config))]
+
+
+def _end(close: Callable[[], object], hook: Hook) -> None:
+    """Close a hook; the run is whole whatever that raises."""
+    try:
+        close()
+    except Exception as error:
+        say(f"the hook {type(hook).__qualname__} raised {type(error).__name__} when it was closed: {error}")
 
 
 def evaluate(argv: list[str]) -> int:
@@ -135,8 +144,9 @@ def evaluate(argv: list[str]) -> int:
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add_trust(parser)
     options = parser.parse_args(argv)
-    result = evaluate_run(single_run(options.run), options.episodes, options.seed, options.best)
+    result = evaluate_run(single_run(options.run, options.trust), options.episodes, options.seed, options.best)
     named = {"run_dir": str(options.run), "parameters": "best" if options.best else "newest"}
     print_result({**result.plain(), **named}, options.json, result.lines())
     return 0

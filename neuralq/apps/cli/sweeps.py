@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import signal
 import sys
 import time
@@ -34,8 +35,10 @@ from neuralq.runs.sweep import (
     stop_with_parent,
 )
 from neuralq.runs.sweep.statistics import interquartile_mean
+from neuralq.runs.trust import refuse_strangers
 
 __all__ = [
+    "add_trust",
     "child",
     "refuse_other_kinds",
     "resume_seeds",
@@ -80,21 +83,39 @@ def resume_seeds(
     num_workers: int | None,
     as_json: bool,
     changes: Mapping[str, Any] = MappingProxyType({}),
+    trust: str = "true",
 ) -> int:
     """Go on with a sweep: seeds that have not finished, and those that failed."""
+    if trust == "false":
+        sweep = open_sweep(path)
+        runs = [run for run in map(sweep.run_path, sweep.seeds) if is_run_folder(run)]
+        for config in (sweep.config, *map(read_config, runs)):
+            refuse_strangers(config, next((name for name in sweep.options if ":" in name), None))
     return _run(open_sweep(path, total_steps, changes), num_workers, as_json, "")
 
 
-def single_run(path: str) -> Path:
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """The option that keeps modules of strangers from being imported."""
+    parser.add_argument(
+        "--trust", choices=("true", "false"), default="true", metavar="{true,false}",
+        help="whether to import the modules that the run names (environment, body) where they are no installed "
+        "packages; a run of somebody else's may bring code along (default: true)",
+    )  # fmt: skip
+
+
+def single_run(path: str, trust: str = "true") -> Path:
     """The folder of one run on an environment.
 
     Raises:
         Failure: if a sweep is there, whose seeds are runs, or a run of another kind.
+        ValueError: without trust, if the run names modules that are no installed packages.
     """
     if is_sweep_folder(path):
         seed = open_sweep(path).seeds[0]
         raise Failure(f"{path} is a sweep of several runs; name one of them, e.g. {Path(path) / f'seed-{seed}'}", 2)
     refuse_other_kinds(path)
+    if trust == "false" and is_run_folder(path):
+        refuse_strangers(read_config(path))
     return Path(path)
 
 

@@ -28,6 +28,7 @@ from typing import IO, Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
+from safetensors.torch import load as load_bytes
 from safetensors.torch import load_file, save_file
 
 from neuralq.checks import check_whole
@@ -121,7 +122,7 @@ def load(path: str | Path) -> Checkpoint:
     step, files = _verified(path)
     try:
         document = json.loads((path / _STATE).read_bytes())
-        tensors = load_file(path / _TENSORS) if _TENSORS in files else {}
+        tensors = _read_tensors(path / _TENSORS) if _TENSORS in files else {}
         arrays = _read_arrays(path / _ARRAYS) if _ARRAYS in files else []
         own = {n: np.load(path / n, allow_pickle=False) for n in files if n.startswith("array-")}
         state = _Unpacking(tensors, arrays, own).unpack(document)
@@ -365,6 +366,15 @@ def _verified(path: Path) -> tuple[int, dict[str, Any]]:
         if got != expected:
             raise CheckpointError(f"{path} is damaged: {name} is not what was written (size or SHA-256 differs)")
     return step, files
+
+
+def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """No path that is not UTF-8 is opened by safetensors, and the name of a folder need not be; bytes it reads."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return load_bytes(path.read_bytes())
+    return load_file(path)
 
 
 def _read_arrays(path: Path) -> list[np.ndarray[Any, Any]]:

@@ -61,7 +61,7 @@ def _arithmetic(device: str) -> dict[str, str]:
     found["instructions of torch"] = torch.backends.cpu.get_cpu_capability()
     found["processor that kernels are compiled for"] = llvmlite.binding.get_host_cpu_name()
     if device != "cpu":
-        cuda = torch.device(device).type == "cuda" and torch.cuda.is_available()
+        cuda = device.startswith("cuda") and torch.cuda.is_available()
         found["accelerator"] = torch.cuda.get_device_name(device) if cuda else device
     return found | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
 

@@ -58,6 +58,10 @@ _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]]
 }
 
 
+_MOST_IN_TURN = 1000
+"""Episodes of evaluation that are played one after another where their environments cannot exist side by side."""
+
+
 def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> VectorEnv[Any, Any, Any]:
     """Parallel environments: the registered vectorised implementation where there is one, else one after another.
 
@@ -212,7 +216,7 @@ def make_evaluation_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any
     try:
         return make_envs(config, num_envs)
     except ValueError:
-        if num_envs == 1:
+        if not 1 < num_envs <= _MOST_IN_TURN:
             raise
         return make_envs(config, 1)
 

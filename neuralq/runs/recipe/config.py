@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_
 
 import numpy as np
 
-from neuralq.checks import check_choice, check_discount, check_fraction, check_positive, check_whole
+from neuralq.checks import MOST_WHOLE, check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
 from neuralq.runs.recipe.games import is_screen
@@ -22,6 +22,7 @@ LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
 _SINGLE = np.finfo(np.float32)
+_MOST_THREADS = 4096
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 _Class = TypeVar("_Class")
 
@@ -137,6 +138,8 @@ class RunConfig:
             "epsilon_decay_steps",
         ):
             check_whole(name, getattr(self, name))
+        if self.threads > _MOST_THREADS:
+            raise ValueError(f"threads must be at most {_MOST_THREADS:,}, got {self.threads:,}")
         if self.evaluation_max_steps is not None:
             check_whole("evaluation_max_steps", self.evaluation_max_steps)
         for name, kind in LEARNERS.items():
@@ -309,6 +312,8 @@ def fitted_value(name: str, value: Any, hint: Any, given: str | None = None) -> 
     """
     kinds = [get_origin(kind) or kind for kind in (get_args(hint) if isinstance(hint, UnionType) else (hint,))]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if is_number and isinstance(value, int) and abs(value) >= MOST_WHOLE:
+        raise ValueError(f"{name} must be a number below 2^128, got one of {value.bit_length():,} bits".lstrip())
     for kind in kinds:
         if kind is float and is_number:
             return float(value)

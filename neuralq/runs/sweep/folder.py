@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import to_json, write_durably
+from neuralq.runs.folder.files import open_regular, parse_json, read_json, to_json, write_durably
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_summary
 
 __all__ = ["Sweep", "create_sweep", "has_finished", "is_sweep_folder", "open_sweep", "steps_so_far"]
@@ -77,10 +77,7 @@ def create_sweep(
         (0, 1, 2)
     """
     path = Path(path)
-    for seed in seeds:
-        check_whole("seed", seed, 0)
-    if not seeds or len(set(seeds)) < len(seeds):
-        raise ValueError(f"a sweep needs one seed or more, each named once, got {list(seeds)}")
+    _check_seeds(list(seeds))
     if is_sweep_folder(path):
         raise RunFolderError(f"{path} already holds a sweep; continue it with `neuralq resume {path}`")
     if is_run_folder(path):
@@ -88,8 +85,31 @@ def create_sweep(
     path.mkdir(parents=True, exist_ok=True)
     write_durably(path / "config.json", to_json(config, "config"))
     marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seeds": list(seeds), "options": list(options)}
-    write_durably(path / "sweep.json", to_json(marker, "sweep"))  # last: it marks a sweep
+    write_durably(path / "sweep.json", to_json(marker, "sweep", sealed=True))  # last: it marks a sweep
     return Sweep(path, dict(config), tuple(seeds), tuple(options))
+
+
+def _check_seeds(seeds: Any) -> None:
+    """They become names of folders, so nothing but whole numbers will do."""
+    for seed in seeds if isinstance(seeds, list) else ():
+        if not isinstance(seed, int):
+            raise ValueError(f"seed must be a whole number, got {seed!r}")
+        check_whole("seed", seed, 0)
+    if not isinstance(seeds, list) or not seeds or len(set(seeds)) < len(seeds):
+        raise ValueError(f"a sweep needs one seed or more, each named once, got {seeds!r}")
+
+
+def _check_options(options: Any) -> None:
+    """They become words of a command line, so nothing but what a sweep is begun with will do."""
+    if not isinstance(options, list):
+        raise ValueError(f"its options must be a list, got {options!r}")
+    words = list(options)
+    while words and words[0] in ("--tensorboard", "--wandb"):
+        del words[0]
+    if words[:1] == ["--hook"] and len(words) == 2 and re.fullmatch(r"[\w.]+:[\w.]+", str(words[1])):
+        return
+    if words:
+        raise ValueError(f"its options hold {words[0]!r}, which no sweep is begun with")
 
 
 def open_sweep(
@@ -104,11 +124,17 @@ def open_sweep(
     if not is_sweep_folder(path):
         raise RunFolderError(f"there is no sweep in {path}; start one with `neuralq train ENV --seeds 10`")
     try:
-        marker, config = (json.loads((path / name).read_bytes()) for name in ("sweep.json", "config.json"))
+        marker, config = (read_json(path / name) for name in ("sweep.json", "config.json"))
         if marker["format"] != FORMAT_NAME or marker["version"] > FORMAT_VERSION:
             raise ValueError(f"it is of format {marker['format']!r}, version {marker['version']!r}")
+        _check_seeds(marker["seeds"])
+        _check_options(marker["options"])
+        check_whole("total_steps", config["total_steps"])
+        check_whole("threads", config.get("threads", 1))
         sweep = Sweep(path, config, tuple(marker["seeds"]), tuple(marker["options"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except KeyError as error:
+        raise RunFolderError(f"the sweep in {path} cannot be read: {error} is missing; restore its files") from error
+    except (RunFolderError, OSError, ValueError, TypeError) as error:
         raise RunFolderError(f"the sweep in {path} cannot be read: {error}") from error
     if total_steps is not None:
         check_whole("total_steps", total_steps)
@@ -130,15 +156,16 @@ def has_finished(sweep: Sweep, seed: int) -> bool:
         return False
     if summary.get("interrupted_by") is not None:
         return False
-    return bool(summary.get("reached")) or int(summary.get("env_steps") or 0) >= sweep.total_steps
+    steps = summary.get("env_steps")
+    return bool(summary.get("reached")) or (isinstance(steps, int) and steps >= sweep.total_steps)
 
 
 def steps_so_far(run_dir: Path) -> int:
     """Environment steps in the last whole line of ``metrics.jsonl``; the file may grow meanwhile."""
     try:
-        with open(run_dir / "metrics.jsonl", "rb") as file:
+        with open(open_regular(run_dir / "metrics.jsonl", os.O_RDONLY), "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
             *_, last, _ = [b"", *file.read().split(b"\n")]
-            return int(json.loads(last)["env_steps"])
-    except (OSError, ValueError, KeyError, TypeError):
+            return int(parse_json(last)["env_steps"])
+    except (RunFolderError, OSError, ValueError, KeyError, TypeError, OverflowError):
         return 0

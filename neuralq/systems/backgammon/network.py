@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_bytes
 from safetensors.numpy import save_file
 
 from neuralq.checks import check_choice, check_positive, check_whole
@@ -123,9 +124,8 @@ class ValueNetwork:
             ValueError: the file is missing, damaged, or holds something else.
         """
         try:
-            with safe_open(str(path), framework="numpy") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}
-        except (OSError, SafetensorError) as error:
+            tensors = load_bytes(Path(path).read_bytes())  # it opens no path that is not UTF-8
+        except (OSError, SafetensorError, KeyError, ValueError) as error:  # of kinds that NumPy does not have
             raise ValueError(
                 f"{path} cannot be read as weights ({error}); train some: neuralq train td-gammon"
             ) from error
