@@ -50,7 +50,7 @@ def refusal(capsys: Capture, argv: list[str], status: int) -> str:
     if lines[-1].startswith("  in "):  # where in somebody's own code
         lines.pop()
     assert not captured.out and "Traceback" not in captured.err
-    assert len(lines) <= 2, captured.err
+    assert len(lines) <= 3, captured.err  # what is prepared, what is wrong, and where in somebody's own code
     assert lines[-1].startswith("neuralq: ")
     return lines[-1]
 

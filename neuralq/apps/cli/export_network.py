@@ -27,7 +27,7 @@ def input_names(agent: Agent) -> list[str]:
     Example:
         >>> from gymnasium import spaces
         >>> from neuralq.runs.stream.encoding import encoder_for
-        >>> space = spaces.Dict(gear=spaces.Discrete(3), arm=spaces.Tuple([spaces.Box(-1, 1, (2,))]))
+        >>> space = spaces.Dict({"arm": spaces.Tuple([spaces.Box(-1, 1, (2,))]), "gear": spaces.Discrete(3)})
         >>> spec = type("Spec", (), {"masked": True})
         >>> input_names(Agent(None, encoder_for(space), spec))
         ['arm.0', 'gear', 'action_mask']

@@ -57,7 +57,7 @@ def explained(error: BaseException) -> list[str] | None:
         ['gamma must lie in [0, 1]']
     """
     own = own_frame(error)
-    if own is None:
+    if own is None or own.filename in str(error):
         return [str(error) or type(error).__name__] if isinstance(error, USER_FAULTS) else None
     told = str(error) if isinstance(error, USER_FAULTS) else f"{type(error).__name__}: {error}"
     line = f"    {own.line}" if own.line else ""

@@ -21,6 +21,10 @@ __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
+_COUNTS = (
+    *("total_steps", "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every", "threads"),
+    "epsilon_decay_steps",
+)
 _SINGLE = np.finfo(np.float32)
 _MOST_THREADS = 4096
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
@@ -128,15 +132,7 @@ class RunConfig:
         check_fraction("epsilon_start", self.epsilon_start)
         check_fraction("epsilon_end", self.epsilon_end)
         check_whole("seed", self.seed, 0)
-        for name in (
-            "total_steps",
-            "evaluate_every",
-            "evaluation_episodes",
-            "checkpoint_every",
-            "log_every",
-            "threads",
-            "epsilon_decay_steps",
-        ):
+        for name in _COUNTS:
             check_whole(name, getattr(self, name))
         if self.threads > _MOST_THREADS:
             raise ValueError(f"threads must be at most {_MOST_THREADS:,}, got {self.threads:,}")

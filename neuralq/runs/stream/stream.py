@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
@@ -15,12 +13,13 @@ from torch import Tensor
 
 from neuralq.checks import check_discount
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
+from neuralq.runs.stream.faults import EnvironmentFault, describe_error
 from neuralq.runs.stream.normalisation import Normalisation
 from neuralq.runs.stream.scaling import Scaling
-from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
+from neuralq.runs.stream.vector_env import SubEnv
 from neuralq.types import Array, Transition
 
-__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "faults_of", "interact"]
+__all__ = ["Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
 
 
 class Policy(Protocol):
@@ -33,28 +32,6 @@ class Policy(Protocol):
     def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
         """Actions and their probabilities."""
         ...
-
-
-class EnvironmentFault(RuntimeError):
-    """An environment broke its contract; says which one, when and in which field."""
-
-
-@contextlib.contextmanager
-def faults_of(doing: str) -> Iterator[None]:
-    """Whatever an environment's own code raises in the block becomes an `EnvironmentFault`.
-
-    Example:
-        >>> with faults_of("resetting"):
-        ...     {}["speed"]
-        Traceback (most recent call last):
-        neuralq.runs.stream.stream.EnvironmentFault: resetting, the environment raised KeyError: 'speed'
-    """
-    try:
-        yield
-    except gym.error.DependencyNotInstalled:  # for which there is a way out
-        raise
-    except Exception as error:
-        raise EnvironmentFault(f"{doing}, the environment raised {type(error).__name__}: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +151,7 @@ class Interaction:
         try:
             observation, info = self.envs.reset(seed=seed)
         except (Exception, SystemExit) as error:
-            raise self._fault(f"at reset, {_describe_error(error)}") from error
+            raise self._fault(f"at reset, {describe_error(error)}") from error
         self._pending[:] = False
         self._returns[:] = 0
         self._lengths[:] = 0
@@ -262,7 +239,7 @@ class Interaction:
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
         except (Exception, SystemExit) as error:
-            raise self._fault(_describe_error(error)) from error
+            raise self._fault(describe_error(error)) from error
         terminated, truncated = self._flags("terminated", terminated), self._flags("truncated", truncated)
         last = terminated | truncated
         r_t = self._checked_reward(reward)
@@ -355,7 +332,7 @@ class Interaction:
             try:
                 observation, info = self.envs.reset(options={"reset_mask": last})
             except (Exception, SystemExit) as error:
-                raise self._fault(_describe_error(error)) from error
+                raise self._fault(describe_error(error)) from error
             fresh = self._observe(observation, info, ended)
             self._s = arrived.copy()
             self._s[ended] = fresh[ended]
@@ -405,14 +382,6 @@ def _act(policy: Policy, s: Array) -> tuple[Array, Array]:
         return on_arrays(s)  # type: ignore[no-any-return]
     action, mu = policy(torch.from_numpy(s))
     return action.numpy(), mu.numpy()
-
-
-def _describe_error(error: BaseException) -> str:
-    if isinstance(error, SubEnvFault | ObservationError):
-        return str(error)
-    if isinstance(error, SystemExit):
-        return f"an environment called sys.exit({'' if error.code is None else repr(error.code)})"
-    return f"an environment raised {type(error).__name__}: {error}"
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any]) -> AutoresetMode:
