@@ -128,3 +128,11 @@ def test_the_seed_of_simulated_trials_is_0_unless_another_is_named() -> None:
     for method in ("rtdp", "labelled-rtdp"):
         plain, zero, one = (solve(mdp, 0.9, method, **more) for more in ({}, {"seed": 0}, {"seed": 1}))  # type: ignore[arg-type]
         assert plain.backups == zero.backups != one.backups
+
+
+def test_sweeping_by_priority_counts_no_iteration_where_nothing_waits() -> None:
+    # From s one step leads to the end. Nothing is earned: 0 is right at once. With a reward one state waits, once.
+    for reward in (0.0, 3.0):
+        mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 1.0]]], [[reward], [np.nan]])
+        answer = solve(mdp, 0.9, "prioritized-sweeping")
+        assert answer.v.tolist() == [reward, 0.0] and answer.iterations == (reward > 0)

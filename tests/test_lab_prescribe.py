@@ -6,6 +6,7 @@ of another distribution's fixed point; variance left out of the order; a remedy 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from neuralq.lab.problems import problem
 from neuralq.lab.trial import run
-from neuralq.lab.verdicts.remedies import Remedy, prescribe
+from neuralq.lab.verdicts.remedies import Remedy, _rank, prescribe
 
 
 @pytest.fixture(scope="module", params=["baird", "emphatic"])
@@ -75,6 +76,16 @@ def test_a_poor_fixed_point_ranks_below_a_good_one() -> None:
     assert error["distribution"] < error["eta"]
     kinds = [one.kind for one in found]
     assert kinds.index("distribution") < kinds.index("eta")
+
+
+def test_a_fixed_point_ranks_by_half_and_by_ten_times_the_best_error() -> None:
+    one = next(one for one in prescribe(problem("kolter")) if one.diagnosis.fixed_point_error is not None)
+
+    def rank(error: float) -> int:
+        found = dataclasses.replace(one.diagnosis, fixed_point_error=error, best_error=1.0, scale=1.0)
+        return _rank(dataclasses.replace(one, diagnosis=found))[1]
+
+    assert [rank(error) for error in (1.0, 1.4, 1.6, 9.9, 10.1, 1e9)] == [0, 0, 1, 1, 2, 2]
 
 
 def test_nothing_is_prescribed_where_nothing_is_wrong() -> None:

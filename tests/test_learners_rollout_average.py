@@ -72,6 +72,13 @@ def test_windows_below_one_are_refused(window: float) -> None:
         IterateAverage(torch.zeros(1), window)
 
 
+def test_a_window_of_rollouts_counts_the_gradient_steps_of_all_their_minibatches() -> None:
+    learner = learner_of(num_epochs=2, num_minibatches=2, average_updates=1.0)  # four steps per rollout: β = ¾
+    learner.update(pair())
+    # each step goes half way to 8: 4, 6, 7, 7.5; weighted (27/64, 9/16, ¾, 1) = (27·4 + 36·6 + 48·7 + 64·7.5)/175
+    assert evaluation_parameters(learner).tolist() == pytest.approx([1140 / 175], rel=1e-15)
+
+
 def test_the_learner_averages_after_every_gradient_step() -> None:
     learner = learner_of(num_epochs=2, average_updates=1.0)  # two steps per rollout: β = ½
     learner.update(pair())

@@ -55,6 +55,8 @@ def test_two_records_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch) ->
         discovered("neuralq.learners", LearnerKind)
     monkeypatch.setattr(rollout, "AGAIN", rollout.ROLLOUT)
     assert list(discovered("neuralq.learners", LearnerKind)) == list(LEARNERS)
+    monkeypatch.setattr(rollout, "AGAIN", dataclasses.replace(rollout.ROLLOUT, name="again"))
+    assert list(discovered("neuralq.learners", LearnerKind))[:2] == ["again", "rollout"]  # of one place by the alphabet
     assert list(LEARNERS)[:5] == ["rollout", "replay", "online", "streaming", "gradient"]
 
 

@@ -152,6 +152,11 @@ def test_inputs_are_not_written() -> None:
     assert all(torch.equal(x, y) for x, y in zip(inputs, copies, strict=True))
 
 
+def test_a_single_greedy_flag_is_no_row_of_them() -> None:
+    with pytest.raises(ValueError, match=r"greedy_tm1 must be bool \[T, \*n\] .*got torch.bool \[\]; pass is_greedy"):
+        watkins_lambda(0.95, torch.tensor(True))
+
+
 def test_watkins_lambda_keeps_float64_and_returns_keep_float32() -> None:
     lam = watkins_lambda(0.95, torch.ones(4, 2, dtype=torch.bool))
     assert lam.dtype == torch.float64 and lam[0, 0].item() == 0.95 and lam[-1].eq(0).all()

@@ -263,7 +263,8 @@ def _main(argv: Sequence[str] | None) -> int:
         return _top(arguments[0])
     module, function = COMMANDS[arguments[0]][:2]
     try:
-        with _present_folder(), warnings.catch_warnings(), _own_output("--json" in arguments):
+        as_json = "--json" in arguments and not {"--help", "-h"} & set(arguments)
+        with _present_folder(), warnings.catch_warnings(), _own_output(as_json):
             command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
             warnings.showwarning = _show_warning
             return command(arguments[1:])

@@ -42,7 +42,7 @@ class SumTree:
     def __init__(self, num_leaves: int) -> None:
         check_whole("num_leaves", num_leaves)
         self.num_leaves = int(num_leaves)
-        self.nodes: Floats = np.zeros(2 * (1 << max(0, self.num_leaves - 1).bit_length()))
+        self.nodes: Floats = np.zeros(2 * (1 << (self.num_leaves - 1).bit_length()))
 
     @property
     def total(self) -> float:
