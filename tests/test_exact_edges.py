@@ -7,13 +7,22 @@ often or too rarely; a check that asks for both of two wrongs.
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
 
-from neuralq.exact import count_optimal_policies, optimal_policies, predict_expected_td, rmsve, solve, td_operator
+from neuralq.exact import (
+    count_optimal_policies,
+    optimal_policies,
+    predict_expected_td,
+    rmsve,
+    solve,
+    solve_average,
+    td_operator,
+)
 from neuralq.mdp import FiniteMDP
 
 
@@ -128,3 +137,11 @@ def test_the_seed_of_simulated_trials_is_0_unless_another_is_named() -> None:
     for method in ("rtdp", "labelled-rtdp"):
         plain, zero, one = (solve(mdp, 0.9, method, **more) for more in ({}, {"seed": 0}, {"seed": 1}))  # type: ignore[arg-type]
         assert plain.backups == zero.backups != one.backups
+
+
+def test_seconds_are_those_of_this_answer() -> None:
+    began = time.perf_counter()
+    found = [solve(line(9), 0.5).seconds, solve(line(9), 1.0 - 1e-3, "value-iteration").seconds]
+    resting = FiniteMDP.from_arrays([[[1.0]]], [[0.0]])
+    found += [solve(resting, 1.0).seconds, solve_average(resting).seconds]
+    assert all(0 < seconds < time.perf_counter() - began for seconds in found)
