@@ -7,13 +7,22 @@ often or too rarely; a check that asks for both of two wrongs.
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
 
-from neuralq.exact import count_optimal_policies, optimal_policies, predict_expected_td, rmsve, solve, td_operator
+from neuralq.exact import (
+    count_optimal_policies,
+    optimal_policies,
+    predict_expected_td,
+    rmsve,
+    solve,
+    solve_average,
+    td_operator,
+)
 from neuralq.mdp import FiniteMDP
 
 
@@ -136,3 +145,11 @@ def test_sweeping_by_priority_counts_no_iteration_where_nothing_waits() -> None:
         mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [0.0, 1.0]]], [[reward], [np.nan]])
         answer = solve(mdp, 0.9, "prioritized-sweeping")
         assert answer.v.tolist() == [reward, 0.0] and answer.iterations == (reward > 0)
+
+
+def test_seconds_are_those_of_this_answer() -> None:
+    began = time.perf_counter()
+    found = [solve(line(9), 0.5).seconds, solve(line(9), 1.0 - 1e-3, "value-iteration").seconds]
+    resting = FiniteMDP.from_arrays([[[1.0]]], [[0.0]])
+    found += [solve(resting, 1.0).seconds, solve_average(resting).seconds]
+    assert all(0 < seconds < time.perf_counter() - began for seconds in found)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.sparse.linalg import ArpackNoConvergence
 
 from neuralq.lab.linear.process import Process, linear_process
 from neuralq.lab.linear.sampling import stream
@@ -180,6 +181,22 @@ def test_unknowns_are_counted_and_limited(monkeypatch: pytest.MonkeyPatch) -> No
                 second_moment_radius(maps_of(process), "markov")
         else:
             assert second_moment_radius(maps_of(process), "markov") > 1
+
+
+def test_leading_factors_that_came_out_are_taken_and_none_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = maps_of(linear_process(star()))
+    monkeypatch.setattr(moments, "LARGEST_DENSE", 5)
+    for found in ([0.5 + 0j], []):
+
+        def stuck(*_: object, found: list[complex] = found, **__: object) -> None:
+            raise ArpackNoConvergence("stuck", np.array(found), np.zeros((0, 0)))
+
+        monkeypatch.setattr(moments, "eigs", stuck)
+        if found:
+            assert second_moment_radius(maps, "markov") == 0.5
+        else:
+            with pytest.raises(ArpackNoConvergence):
+                second_moment_radius(maps, "markov")
 
 
 def test_step_size_limits_of_ridge_on_the_star() -> None:

@@ -243,6 +243,16 @@ def test_the_target_copy_is_renewed_at_its_period(layout: str) -> None:
     assert learner.num_updates == 5
 
 
+def test_what_is_not_set_is_pqn_scaled_down() -> None:
+    # Runs that name nothing are compared with each other for years: a default that moves is a changed result.
+    left = RolloutSettings()
+    assert (left.lambda_, left.returns, left.optimiser, left.max_grad_norm) == (0.65, "peng", "radam", 10.0)
+    assert (left.num_envs, left.num_steps, left.num_epochs, left.num_minibatches) == (32, 32, 4, 4)
+    assert (left.learning_rate, left.target_period_updates, left.average_updates) == (1e-3, None, None)
+    assert (left.anneal, left.anneal_env_steps, left.anneal_to) == (False, None, 0.0)
+    assert not (left.normalise_observations or left.refresh_targets)
+
+
 def test_reward_scale_and_annealing() -> None:
     engine = make_engine(TableQ(2, 1), Loss())
     one = torch.ones(1, 1, dtype=torch.float64)
