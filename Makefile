@@ -18,6 +18,7 @@ CREATED := $(STAMPS)/created
 DEMO_INSTALLED := $(STAMPS)/installed-plot
 TEST_INSTALLED := $(STAMPS)/installed-test
 DEV_INSTALLED := $(STAMPS)/installed-dev
+MUTANTS_INSTALLED := $(STAMPS)/installed-mutants
 FAST_PASSED := $(STAMPS)/fast-tests-passed
 
 # What decides whether the tests must run again: these files, and (through LISTED) that none was added or removed.
@@ -30,7 +31,7 @@ LISTED := $(STAMPS)/sources
 # (--dist loadfile), so that the kernels of a file are not compiled in each of them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test check slow wheel clean always
+.PHONY: help demo test check slow mutants wheel clean always
 
 help:  ## lists the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
@@ -51,6 +52,9 @@ check: $(DEV_INSTALLED)  ## format, lint, types, floors, and the fast tests unle
 	$(BIN)/lint-imports
 	@$(MAKE) --no-print-directory $(FAST_PASSED)
 	@echo "All checks passed."
+
+mutants: $(MUTANTS_INSTALLED) $(FAST_PASSED)  ## breaks the code in small ways for half an hour: do tests notice?
+	@$(BIN)/python scripts/mutants.py --workers $(WORKERS)
 
 wheel: $(DEV_INSTALLED)  ## builds the wheel into dist/
 	@$(BIN)/python -m build --no-isolation --wheel
@@ -90,6 +94,9 @@ $(TEST_INSTALLED): $(CREATED) pyproject.toml constraints.txt
 
 $(DEV_INSTALLED): $(TEST_INSTALLED)
 	@$(call install,dev)
+
+$(MUTANTS_INSTALLED): $(TEST_INSTALLED)
+	@$(call install,mutants)
 
 # A .venv that is there and works is kept.
 $(CREATED):

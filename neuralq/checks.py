@@ -16,6 +16,7 @@ __all__ = [
     "check_discount",
     "check_fits",
     "check_fraction",
+    "check_module_name",
     "check_positive",
     "check_whole",
 ]
@@ -27,6 +28,26 @@ MOST_WHOLE = 2**128
 
 class MissingExtra(ImportError):
     """An optional dependency is not installed; the message holds the command that installs it."""
+
+
+def check_module_name(what: str, name: str, given: str) -> None:
+    """``name`` can name a module; what it holds is imported, and a file is not a module's name.
+
+    Raises:
+        ValueError: otherwise, with the name that the file would have.
+
+    Example:
+        >>> check_module_name("the environment", "./my_env.py", "./my_env.py:X-v0")
+        Traceback (most recent call last):
+        ValueError: the environment './my_env.py:X-v0' must name a module before the colon, as in 'my_env:X-v0' ...
+    """
+    if all(part.isidentifier() for part in name.split(".")):
+        return
+    stem = Path(name).stem if Path(name).stem.isidentifier() else "my_module"
+    raise ValueError(
+        f"{what} {given!r} must name a module before the colon, as in '{stem}:{given.rpartition(':')[2]}' for a file "
+        f"{stem}.py in the present folder"
+    )
 
 
 def check_fraction(name: str, value: float, hint: str = "") -> None:

@@ -136,7 +136,7 @@ def test_many_settings_stand_below_the_table(tmp_path: Path, capsys: Capture) ->
     assert main(["compare", *map(str, paths)]) == 0
     header, first, second, *below = capsys.readouterr().out.splitlines()
     assert header.split() == "run seeds greedy return 95 % interval mean steps CPU s".split()
-    assert first.split()[:3] == ["a", "1", "1.0"] and second.split()[:3] == ["b", "1", "2.0"]
+    assert first.split()[:3] == ["a", "1", "1.000"] and second.split()[:3] == ["b", "1", "2.0"]
     assert len(below) == 2 and below[0].startswith("a: streaming.setting_0 0.5, ") and below[1].startswith("b: ")
     assert "setting" not in below[1], "what a run does not have is not listed for it"
 

@@ -81,3 +81,19 @@ def test_a_solver_that_is_stopped_fails(capsys: Capture) -> None:
     result = json.loads(captured.out.splitlines()[-1])
     assert result["converged"] is False and result["bound"] > 1e-8
     assert captured.err.startswith("neuralq: did not converge")
+
+
+def test_a_table_that_is_not_the_environment_is_refused(capsys: Capture) -> None:
+    # A fickle passenger changes the destination under way: step does it, and the table does not know.
+    fickle = ["Taxi-v4", "--gamma", "1", "--env-kwargs", '{"fickle_passenger": true, "fickle_probability": 1.0}']
+    assert main(["solve", *fickle]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert "does not do what its table says: in state" in captured.err and "--no-check" in captured.err
+    assert solved(capsys, *fickle, "--no-check")["converged"]  # the way out works
+
+
+def test_a_time_limit_is_said(capsys: Capture) -> None:
+    assert main(["solve", "FrozenLake-v1"]) == 0
+    assert "episodes are cut after 100 steps; these are the values without the cut" in capsys.readouterr().out
+    assert solved(capsys, "FrozenLake-v1")["max_episode_steps"] == 100

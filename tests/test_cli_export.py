@@ -15,12 +15,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 from neuralq.apps.cli import export as export_module
 from neuralq.apps.cli import main
-from neuralq.runs import load
-from neuralq.runs.stream import Normalisation
+from neuralq.runs import RunConfig, load
+from neuralq.runs.agent import Agent
+from neuralq.runs.recipe.build import build_q, make_envs
+from neuralq.runs.stream import Interaction, Normalisation
+from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.sweep import create_sweep
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -62,7 +66,7 @@ def trained(path: Path, env: str, *words: str) -> str:
         ("CartPole-v1", ["--layout", "action-input"], [4]),
         ("CartPole-v1", ["--layout", "separate"], [4]),
         ("CartPole-v1", ["--layout", "linear"], [4]),
-        ("neuralq/MitchellGrid-v0", ["--layout", "table"], [5]),  # a state and 4 legal moves
+        ("neuralq/MitchellGrid-v0", ["--layout", "table"], []),  # a state, and 4 legal moves beside it
         ("FrozenLake-v1", ["--layout", "action-output"], []),
         ("test/Offset-v0", [], [2, 12, 12]),
     ],
@@ -81,11 +85,12 @@ def test_the_file_gives_the_runs_values(
     played = gym.make(env)
     observation, info = played.reset(seed=1)
     mask = info.get("action_mask")
-    encoded = np.asarray(agent.encoder.encode_single(observation))
+    given = {"observation": np.stack([observation] * 5)}
     if mask is not None:
-        encoded = np.concatenate([encoded.reshape(-1), mask])
-    assert result["input"]["shape"] == ["n", *encoded.shape] and (not shape or list(encoded.shape) == shape)
-    values, action = session.run(None, {"observation": np.stack([encoded] * 5).astype(result["input"]["dtype"])})
+        given["action_mask"] = np.array([mask != 0] * 5)
+    assert [(one["name"], one["dtype"]) for one in result["inputs"]] == [(k, str(x.dtype)) for k, x in given.items()]
+    assert result["inputs"][0]["shape"] == ["n", *shape]
+    values, action = session.run(None, given)
     expected = agent.values(observation, mask)
     assert values.shape == (5, len(expected)) and played.action_space.contains(np.int64(action[0]))
     np.testing.assert_allclose(values[3], expected, rtol=1e-5, atol=1e-5)
@@ -124,11 +129,13 @@ def test_a_file_that_differs_is_not_kept(tmp_path: Path, monkeypatch: pytest.Mon
 def test_greedy_actions_are_compared_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     run = trained(tmp_path / "run", "test/Offset-v0")
 
-    def forward(self: Any, s: Any) -> Any:
-        values = self.q.all(s) / self.scale
+    forward = export_module.ExportedNetwork.forward
+
+    def worst(self: Any, *inputs: Any) -> Any:
+        values, _ = forward(self, *inputs)
         return values, values.argmin(-1) + self.first_action
 
-    monkeypatch.setattr(export_module._Exported, "forward", forward)
+    monkeypatch.setattr(export_module.ExportedNetwork, "forward", worst)
     assert main(["export", run, "--onnx", str(tmp_path / "policy.onnx")]) == 1
     assert "differs from the run's by inf" in capsys.readouterr().err
 
@@ -146,7 +153,7 @@ def test_statistics_of_observations_are_part_of_the_file(
     capsys.readouterr()
     assert main(["export", run, "--onnx", str(tmp_path / "policy.onnx"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    # The fourth observation is 50 where ±1 is seen, thousands of deviations away: values are large, and the bound too.
+    # The fourth observation is 50 ± 0.01 where ±1 is seen: as far away as anything is seen.
     assert result["max_abs_difference"] <= result["allowed"]
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     s = np.array([0.5, 1.05, -1.0, 50.005], np.float32)
@@ -166,3 +173,97 @@ def test_what_cannot_be_exported_is_one_error(tmp_path: Path, monkeypatch: pytes
         assert main(["export", run, "--onnx", str(tmp_path / "x.onnx")]) == 1
         assert 'pip install "neuralq[onnx]"' in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "sweep"]
+
+
+class Strange(gym.Env[Any, Any]):
+    """Observations of a space that is given, with a mask or without one; actions are numbered from −1."""
+
+    action_space = spaces.Discrete(3, start=-1)
+
+    def __init__(self, which: str, masked: bool = False) -> None:
+        self.observation_space, self.masked = SPACES[which], masked
+
+    def look(self) -> tuple[Any, dict[str, Any]]:
+        mask = self.np_random.integers(0, 2, 3, np.int8)
+        mask[1] = 1
+        return self.observation_space.sample(), {"action_mask": mask} if self.masked else {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.look()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, info = self.look()
+        return observation, float(action), bool(self.np_random.random() < 0.2), False, info
+
+
+SPACES: dict[str, gym.Space[Any]] = {
+    "start": spaces.Discrete(4, start=-2),
+    "late": spaces.Discrete(4, start=7),
+    "bits": spaces.MultiBinary((2, 3)),
+    "digits": spaces.MultiDiscrete([[2, 3], [4, 1]], start=[[1, 0], [-1, 5]]),
+    "bytes": spaces.Box(0, 255, (5,), np.uint8),
+    "planes": spaces.Box(0, 1, (6, 6, 2), np.uint8),
+    "wide": spaces.Box(np.array([1e9, -np.inf]), np.array([1e9 + 100, np.inf]), dtype=np.float64),
+    "scalar": spaces.Box(-1, 1, ()),
+    "dict": spaces.Dict(
+        speed=spaces.Box(-100, 100, (2,)), gear=spaces.Discrete(3, start=1),
+        arm=spaces.Tuple([spaces.MultiDiscrete([2, 3]), spaces.Box(0, 255, (2, 2), np.uint8)]),
+    ),
+}  # fmt: skip
+gym.register("test/Strange-v0", Strange)
+
+
+def untrained(which: str, masked: bool, layout: str, normalised: bool) -> tuple[RunConfig, Agent]:
+    kwargs = {"which": which, "masked": masked}
+    config = RunConfig(env="test/Strange-v0", env_kwargs=kwargs, layout=layout, reward_scale=0.1)
+    envs = make_envs(config, 1)
+    space = envs.single_observation_space
+    seen = Normalisation(encoder_for(space, wide=True).shape, 0.9, 1, rewards=False) if normalised else None
+    stream = Interaction(envs, 0.9, 0, layout == "table", seen)
+    for _ in range(9):
+        stream.step(choose_legal)
+    q = build_q(config, stream.spec, np.random.default_rng(0))
+    return config, Agent(q, stream.encoder, stream.spec, -1, 0.1, None if seen is None else seen.frozen())
+
+
+def choose_legal(s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones(len(s), dtype=torch.int64), torch.ones(len(s))
+
+
+CASES = [(which, "action-output", which == "wide") for which in SPACES]
+CASES += [("start", "table", False), ("digits", "table", False), ("dict", "linear", False), ("dict", "linear", True)]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("which", "layout", "normalised"), CASES)
+def test_the_file_takes_what_the_environment_gives(
+    which: str, layout: str, normalised: bool, masked: bool, tmp_path: Path
+) -> None:
+    config, agent = untrained(which, masked, layout, normalised)
+    inputs, expected = export_module._played(config, agent)
+    export_module._write_checked(agent, config, tmp_path / "policy.onnx", inputs, expected)
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    names = ["speed", "gear", "arm.0", "arm.1"] if which == "dict" else ["observation"]
+    assert [one.name for one in session.get_inputs()] == [*names, *(["action_mask"] if masked else [])]
+    env = gym.make("test/Strange-v0", which=which, masked=masked)
+    for seed in range(20):
+        x, info = env.reset(seed=seed)
+        parts = [x["speed"], x["gear"], *x["arm"]] if which == "dict" else [x]
+        given = {name: np.asarray(value)[None] for name, value in zip(names, parts, strict=True)}
+        mask = info.get("action_mask")
+        if masked:
+            given["action_mask"] = mask[None] != 0
+        values, action = session.run(None, given)
+        np.testing.assert_allclose(values[0], agent.values(x, mask), rtol=1e-5, atol=1e-5)
+        assert action[0] == agent.predict(x, mask)
+
+
+def test_the_inputs_of_the_file_are_said(tmp_path: Path, capsys: Capture) -> None:
+    kwargs = ["--env-kwargs", json.dumps({"which": "dict", "masked": True})]
+    run = trained(tmp_path / "run", "test/Strange-v0", *kwargs)
+    capsys.readouterr()
+    assert main(["export", run, "--onnx", str(tmp_path / "policy.onnx")]) == 0
+    wanted = "speed float32 [n, 2], gear int64 [n], arm.0 int64 [n, 2], arm.1 uint8 [n, 2, 2], action_mask bool [n, 3]"
+    assert wanted in capsys.readouterr().out

@@ -185,7 +185,7 @@ def long_run(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return lazy
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_average_reward_by_enumeration(seed: int) -> None:
     mdp = random_model(seed)

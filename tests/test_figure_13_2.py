@@ -51,7 +51,12 @@ def largest_error(folder: Path, layout: str, seed: int, **changes: Any) -> float
     return float(np.max(errors))
 
 
-@pytest.mark.parametrize("layout", BOUND)
+# The table and the network of the chapter; the rest of the layouts with the slow seeds.
+FAST = [pytest.param(name, marks=[] if name in ("table", "action-output") else pytest.mark.slow) for name in BOUND]
+ALSO_SLOWLY = ["table", pytest.param("action-output", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("layout", FAST)
 def test_the_figure_is_learned(layout: str, tmp_path: Path) -> None:
     assert largest_error(tmp_path, layout, seed=0) <= BOUND[layout]
 
@@ -82,12 +87,12 @@ SHORT = {"env_kwargs": {"max_episode_steps": 2}}
 LIMITED = {"env_kwargs": {"max_episode_steps": 20}}  # or the evaluation of a wrong policy would never end
 
 
-@pytest.mark.parametrize("layout", ["table", "action-output"])
+@pytest.mark.parametrize("layout", ALSO_SLOWLY)
 def test_a_time_limit_changes_nothing(layout: str, tmp_path: Path) -> None:
     assert largest_error(tmp_path, layout, 0, **SHORT) <= BOUND[layout]
 
 
-@pytest.mark.parametrize("layout", ["table", "action-output"])
+@pytest.mark.parametrize("layout", ALSO_SLOWLY)
 def test_truncation_taken_for_termination_fails(layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add = RolloutExperience.add
 

@@ -46,8 +46,23 @@ def test_channels_are_found_or_given(shape: tuple[int, ...], order: str, wanted:
 def test_an_order_that_cannot_be_seen_is_asked_for(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="give the Conv body channel_order='first' or 'last'"):
         ActionOutputQ(shape, 2, Conv())
-    with pytest.raises(ValueError, match="make a stack of frames its channels"):
-        channels_first((4, *shape))
+    with pytest.raises(ValueError, match="use an MLP body, or make it one of these"):
+        channels_first((2, 4, *shape))
+
+
+@pytest.mark.parametrize(("shape", "order"), [((4, 6, 5, 3), "auto"), ((4, 3, 6, 5), "auto"), ((4, 5, 5, 5), "last")])
+@pytest.mark.parametrize("layout", [ActionOutputQ, SeparateQ])
+def test_a_stack_of_colour_frames_is_one_frame_with_all_their_channels(
+    shape: tuple[int, ...], order: str, layout: Any
+) -> None:
+    assert isinstance(body_for((4, 84, 84, 3), True), Conv), "and not a flat network"
+    s = torch.rand(2, *shape)
+    channels = s if shape[1] == 3 else s.permute(0, 1, 4, 2, 3)
+    stacked = layout(shape, 2, Conv((4,), (3,), (1,), (8,), channel_order=order), rng=3)
+    flat = layout(
+        tuple(channels.flatten(1, 2).shape[1:]), 2, Conv((4,), (3,), (1,), (8,), channel_order="first"), rng=3
+    )
+    torch.testing.assert_close(stacked.all(s), flat.all(channels.flatten(1, 2)))
 
 
 @pytest.mark.parametrize("layout", [ActionOutputQ, SeparateQ])

@@ -8,21 +8,24 @@ of the user's own that is not called, or not closed.
 from __future__ import annotations
 
 import io
+import re
 import sys
 import time
+import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from neuralq.apps.cli import main
+from neuralq.apps.cli import _show_warning, main
 from neuralq.apps.cli.progress import ProgressBar, training_bar
 from neuralq.checks import MissingExtra
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
 from neuralq.runs import RunConfig, train
 from neuralq.runs.control import CONTROL
+from neuralq.runs.evaluation import Evaluation, shown
 from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.hooks import TensorBoard, own_hook
 from neuralq.runs.kinds import kind_named
@@ -178,3 +181,51 @@ def test_hooks_see_every_row_that_is_stored_and_change_nothing(tmp_path: Path) -
     assert seen == read_metrics(tmp_path / "watched")
     assert {row["kind"] for row in seen} == {"train", "evaluation"}
     assert watched.parameters_sha256 == train(config, tmp_path / "alone").parameters_sha256
+
+
+def drawn(columns: int, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The last state of a bar in a terminal of this width, without what moves the cursor."""
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(columns))
+    stream = Terminal()
+    with run_bar(stream, total_steps=100_000, stop_at_return=475.0) as bar:
+        bar(row(25_000, abs_td_error=0.12345, max_q=8.0))
+        bar({"kind": "evaluation", "env_steps": 25_000, "greedy_return": 99.5})
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stream.getvalue()).replace("\r", "\n").strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 120])
+def test_a_narrow_terminal_keeps_the_bar_the_count_and_the_time(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = drawn(columns, monkeypatch)
+    assert "━" in line and " 25000/100000 --:-- " in line and len(line) <= columns
+    assert columns < 60 or columns >= 100 or "greedy 99.5" in line
+
+
+def test_in_a_notebook_the_first_line_comes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ipykernel", types.ModuleType("ipykernel"))
+    now, stream = [0.0], io.StringIO()
+    with run_bar(stream, lambda: now[0], total_steps=10_000) as bar:
+        for second in (0.0, 1.0, 3.0):
+            now[0] = second
+            bar(row(int(1000 * second)))
+    assert [line.split(" of ")[0] for line in stream.getvalue().splitlines()] == ["0", "3,000"]
+
+
+@pytest.mark.parametrize(("value", "wanted"), [(20.24, "20.2"), (0.9731, "0.973"), (-0.05, "-0.050"), (1.25, "1.2")])
+def test_returns_within_one_are_told_in_three_decimals(value: float, wanted: str) -> None:
+    assert shown(value) == wanted
+    lines = Evaluation((value, value), (1, 1), 0).lines()
+    assert lines[0].startswith(
+        f"mean return {value:.4f} ± 0.0000" if abs(value) < 1 else f"mean return {value:.2f} ± 0.00"
+    )
+    assert f"lowest {wanted}, quartiles {wanted} {wanted} {wanted}, highest {wanted}" == lines[1]
+
+
+def test_warnings_of_others_come_without_their_colours(capsys: pytest.CaptureFixture[str]) -> None:
+    _show_warning("\x1b[33mWARN: The obs is not within the observation space.\x1b[0m", UserWarning, "x.py", 1)
+    assert capsys.readouterr().err == "neuralq: warning: The obs is not within the observation space.\n"

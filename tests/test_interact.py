@@ -27,6 +27,7 @@ from neuralq.runs.stream import EnvironmentFault, Interaction, Step, interact, m
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy
 from neuralq.runs.stream.experience import ReplayExperience
 from neuralq.types import Transition
+from neuralq_envs import register  # noqa: F401 - which the import does
 
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
 GAMMA = 0.9
@@ -476,11 +477,15 @@ def _forget_the_fake_step(stream: Interaction) -> None:
         return episodes
 
     stream._finish = finish  # type: ignore[method-assign]
-    stream._true_successors = lambda arrived, *rest: arrived  # type: ignore[method-assign]
+    _next_episodes_successor(stream)
 
 
 def _next_episodes_successor(stream: Interaction) -> None:
-    stream._true_successors = lambda arrived, *rest: arrived  # type: ignore[method-assign]
+    def across(observation: Any, last: Any, terminated: Any, info: Any) -> Any:
+        arrived = stream._observe(observation, info, stream._everyone)
+        return arrived, arrived
+
+    stream._across_the_end = across  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(

@@ -146,6 +146,42 @@ def test_large_operators_are_applied_without_a_matrix(monkeypatch: pytest.Monkey
         second_moment_radius(maps[0], "markov")
 
 
+def test_stability_is_the_same_by_a_linear_system_and_by_eigenvalues(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ridge η = ½ on the star settles below α = .1441962 along a chain; 7 rows of 28 numbers are 196 unknowns."""
+    process = visible_process(linear_process(star()))[0]
+    maps = [maps_of(process, step_size=a, eta=0.5) for a in (0.1, 0.144, 0.1444, 0.3)]
+    size = maps[0].M.shape[1]
+    num_unknowns = len(np.unique(maps[0].row)) * size * (size + 1) // 2
+    leading = moments._leading
+    for most, by_eigenvalues in ((num_unknowns, False), (num_unknowns - 1, True)):
+        asked: list[int] = []
+        monkeypatch.setattr(moments, "LARGEST_DENSE", most)
+        monkeypatch.setattr(
+            moments, "_leading", lambda one, moment, asked=asked: asked.append(1) or leading(one, moment)
+        )
+        assert [second_moment_stable(one, "markov") for one in maps] == [True, True, False, False]
+        assert bool(asked) == by_eigenvalues
+
+
+def test_unknowns_are_counted_and_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    process = linear_process(two_states())
+    assert moments.unknowns(process, 3, "iid") == 9 and moments.unknowns(process, 3, "markov") == 18
+    one = method("td")
+    found = moments.known_second_moment(two_states(), one, one.checked({}), 0.01, "markov")
+    assert found == pytest.approx(second_moment_radius(maps_of(process), "markov"))
+    least = moments.unknowns(process, 1, "markov")
+    for most, known in ((least, True), (least - 1, False)):
+        value = moments.known_second_moment(two_states(), one, one.checked({}), 0.01, "markov", most)
+        assert (value is not None) == known
+    for limit, refused in ((2, False), (1, True)):  # two rows of one number
+        monkeypatch.setattr(moments, "LARGEST", limit)
+        if refused:
+            with pytest.raises(ValueError, match="2 unknowns are too many"):
+                second_moment_radius(maps_of(process), "markov")
+        else:
+            assert second_moment_radius(maps_of(process), "markov") > 1
+
+
 def test_step_size_limits_of_ridge_on_the_star() -> None:
     """η = .5; .129883 from an independent scan, .1441962181 from the 448x448 operator of `kron_radius`."""
     process = visible_process(linear_process(star()))[0]

@@ -257,6 +257,42 @@ def test_reward_scale_and_annealing() -> None:
     assert engine.flat.values.tolist() == [1.25, 0.0]  # and to nothing
 
 
+def rates_of(learner: RolloutLearner, t: Transition, weights: list[Tensor | None]) -> list[float]:
+    """The share of the learning rate with which each rollout is fitted."""
+    seen: list[float] = []
+    fit = learner._descent.fit
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learner._descent, "fit", lambda s, a, y, w, scale: seen.append(scale) or fit(s, a, y, w, scale))
+        for weight in weights:
+            learner.update(t, weight)
+    return seen
+
+
+def test_a_schedule_of_steps_counts_steps_and_not_the_rows_in_which_an_environment_waits() -> None:
+    t = rollout("action-output", engine_of("action-output"), "everything")
+    held = torch.zeros_like(t.r_t, dtype=torch.float32).flatten()
+    held[: len(held) // 3] = 1  # 9 of 27 rows, as where most environments wait for their reset
+    settings = settings_with(num_envs=t.r_t.shape[1], num_steps=t.r_t.shape[0])
+
+    def fresh() -> RolloutLearner:
+        return RolloutLearner(engine_of("action-output"), settings, np.random.default_rng(0), total_updates=2)
+
+    thin = held.view_as(t.r_t)
+    assert rates_of(fresh(), t, [thin] * 7) == pytest.approx([1, 5 / 6, 4 / 6, 3 / 6, 2 / 6, 1 / 6, 0], abs=1e-12)
+    assert rates_of(fresh(), t, [None, thin, thin, None]) == pytest.approx([1, 1 / 2, 1 / 3, 1 / 6], abs=1e-12)
+    # A run goes on where it was; one of before steps were counted had no rows without them.
+    one, old = fresh(), fresh()
+    rates_of(one, t, [None, thin])
+    state = one.state_dict()
+    old.load_state_dict(copy.deepcopy(state))
+    assert rates_of(old, t, [thin]) == pytest.approx([1 / 3])
+    del state["num_steps"]
+    state["num_updates"] = 1
+    older = fresh()
+    older.load_state_dict(state)
+    assert rates_of(older, t, [thin]) == [0.5]
+
+
 @pytest.mark.parametrize("optimiser", ["sgd", "adam", "radam"])
 def test_a_saved_learner_goes_on_bit_for_bit(optimiser: str) -> None:
     def fresh() -> RolloutLearner:

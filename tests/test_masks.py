@@ -25,9 +25,10 @@ from neuralq.q import MLP, MaskedQ
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import evaluate_greedy
-from neuralq.runs.folder.env_probe import Resumability
+from neuralq.runs.folder.env_probe import Resumability, is_resumable
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session
+from neuralq.runs.recipe.presets import with_preset
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, SubEnv, legal_actions, make_vector_env
 from neuralq.runs.stream.acting import choose_epsilon_greedy, choose_greedy
@@ -285,3 +286,52 @@ def test_a_mask_is_stored_in_the_kind_of_what_it_goes_with(kind: str, dtype: typ
         assert np.isneginf(agent.values(seen, env.action_masks())).tolist() == [False, False, True]  # type: ignore[attr-defined]
     finally:
         session.close()
+
+
+class Strict(Tempting):
+    """One action is legal in each state and 0 in none; what is illegal raises, from the first step on."""
+
+    LEGAL = np.array([[0, 0, 1], [0, 1, 0], [0, 0, 1]], np.int8)
+
+    def __init__(self, kind: str = "vector", told: str = "info") -> None:
+        super().__init__(kind, told)
+        if told != "info":
+            setattr(self, told, lambda: self.LEGAL[self.s].astype(bool))
+
+    def look(self) -> tuple[Any, dict[str, Any]]:
+        seen, extra = super().look()
+        return seen, {"action_mask": self.LEGAL[self.s].copy()} if extra else {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.LEGAL[self.s][action], f"action {action} is illegal in state {self.s}"
+        self.s, self.t = (self.s + 1) % 3, self.t + 1
+        seen, extra = self.look()
+        return seen, 1.0, self.t == LENGTH, False, extra
+
+
+gym.register("Strict-v0", Strict)
+
+
+@pytest.mark.parametrize("layout", ["table", "action-output"])
+@pytest.mark.parametrize("told", ["info", "action_masks"])
+@pytest.mark.parametrize(
+    ("learner", "settings"),
+    [
+        ("rollout", {}), ("online", {}), ("gradient", {}), ("streaming", {}), ("streaming", {"bound": "intentional"}),
+        ("replay", {"prioritised": True}), ("replay", {"target_rule": "retrace", "block_length": 8, "batch_size": 32}),
+        ("replay", {"target_rule": "dqrc", "target_period_updates": None}),
+    ],
+)  # fmt: skip
+def test_nothing_that_is_done_before_training_takes_an_illegal_action(
+    learner: str, settings: dict[str, Any], told: str, layout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "is_resumable", is_resumable)
+    session = build_session(
+        with_preset({
+            "env": "Strict-v0", "env_kwargs": {"kind": "index" if layout == "table" else "vector", "told": told},
+            "layout": layout, "learner": learner, learner: settings, "evaluation_episodes": 2,
+        })
+    )  # fmt: skip
+    assert session.resumability.exact, session.resumability.reason  # the probe played, and nothing was raised
+    assert session.play_greedily(0).returns == (LENGTH, LENGTH)
+    session.close()

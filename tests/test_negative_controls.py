@@ -108,7 +108,7 @@ LEARNED: dict[str, Any] = {
     "streaming, intentional": replace(STREAMING, bound="intentional", step_size=0.05),
     "gradient, qrc": GradientSettings(**GRADIENT),
 }
-FAST = ("rollout, peng", "online, accumulating")
+FAST = ("rollout, peng",)
 
 
 def learned(name: str, mistake: str | None) -> Any:

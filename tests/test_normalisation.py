@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from neuralq.runs.stream import Interaction, Normalisation, make_vector_env
+from neuralq.runs.stream.normalisation import CLIP
 
 ALWAYS = np.ones(1, bool)
 
@@ -136,12 +137,6 @@ def test_the_stream_is_seen_through_its_statistics(mode: AutoresetMode) -> None:
         here = expected()
         if last[0]:
             assert step.episodes[0].episode_return == 30.0 and taken % 3 == 0
-            if mode is AutoresetMode.SAME_STEP:  # the next episode's first observation comes before the last one's
-                arrived.insert(-1, 0.0)
-                here = expected()
-                assert s_t[0, 0] == pytest.approx(here, abs=1e-6)
-                left = float(stream.state_dict()["s"][0, 0])
-                continue
             arrived.append(0.0)
             left = expected()
             arrived_here = here
@@ -151,3 +146,79 @@ def test_the_stream_is_seen_through_its_statistics(mode: AutoresetMode) -> None:
             left = here
         assert r_t[0] != 10.0 or taken == 1
     assert seen.state_dict()["observation_count"][0] == len(arrived)
+
+
+def test_a_spread_that_was_never_seen_divides_nothing() -> None:
+    seen = Normalisation((1,), 0.9, 1)
+    for _ in range(100):
+        seen.observe(np.full((1, 1), 0.1))
+    view = seen.frozen()
+    assert view.observe(np.full((1, 1), 0.2))[0, 0] == pytest.approx(0.1), "(0.2 − 0.1) / 1, not / 1e-4"
+    mean, inverse = seen.scaling() or (0.0, 0.0)
+    assert (0.2 - mean) * inverse == pytest.approx(0.1)
+
+
+def test_rewards_whose_sums_are_all_alike_are_not_divided_by_nothing() -> None:
+    seen = Normalisation((1,), 0.9, 1)
+    for _ in range(5):  # episodes of one step
+        assert seen.reward(np.array([3.0]), ALWAYS, ALWAYS)[0] == pytest.approx(3.0)
+    assert seen.reward_scale == pytest.approx(1.0)
+
+
+def test_what_was_as_good_as_constant_is_clipped_when_it_moves() -> None:
+    seen = Normalisation((2,), 0.9, 1)
+    for x in (0.1, 0.1000001, 0.1, 0.1000001):
+        seen.observe(np.array([[x, x]]))
+    out = seen.frozen().observe(np.array([[5.0, -5.0]]))
+    assert out.tolist() == [[CLIP, -CLIP]]
+
+
+def test_a_large_offset_is_subtracted_before_float32_rounds_it_away() -> None:
+    space, ticks = spaces.Box(-np.inf, np.inf, (1,), np.float64), 1e9 + np.arange(5.0)
+
+    class Clock(Counter):
+        observation_space = space
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+            super().reset(seed=seed)
+            return ticks[:1].copy(), {}
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            self.t += 1
+            return ticks[self.t : self.t + 1].copy(), 0.0, False, False, {}
+
+    stream = Interaction(make_vector_env(Clock, 1), 0.9, 0, normalisation=Normalisation((1,), 0.9, 1))
+    for t in range(1, 5):
+        here = stream.step(first).rows[5][0, 0]
+        # 0..t have mean t/2 and sample variance (t + 1)(t + 2)/12.
+        assert here == pytest.approx((t / 2) / np.sqrt((t + 1) * (t + 2) / 12), rel=1e-5)
+    assert here.dtype == np.float32
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_episodes_that_restart_in_the_same_step_teach_in_the_order_of_all_others(num_envs: int) -> None:
+    def streamed(mode: AutoresetMode) -> tuple[list[Any], dict[str, Any]]:
+        made = [lambda i=i: Late(i) for i in range(num_envs)]
+        envs: Any = SyncVectorEnv(made, autoreset_mode=mode)  # type: ignore[arg-type]
+        seen = Normalisation((1,), 0.9, num_envs)
+        stream = Interaction(envs, 0.9, 0, normalisation=seen)
+        return [stream.step(first).rows for _ in range(12)], seen.state_dict()
+
+    (one, in_one), (two, in_two) = streamed(AutoresetMode.SAME_STEP), streamed(AutoresetMode.DISABLED)
+    for rows in zip(one, two, strict=True):
+        for mine, theirs in zip(*rows, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    for name, value in in_one.items():
+        np.testing.assert_array_equal(value, in_two[name])
+
+
+class Late(Counter):
+    """A counter that starts at its index, so that environments end at different times."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        _, info = super().reset(seed=seed)
+        self.t, self.index = self.index % 3, 0
+        return np.full(1, self.t - 7.0, np.float32), info

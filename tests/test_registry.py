@@ -165,6 +165,7 @@ def test_a_learner_in_a_file_of_its_own_is_offered_trains_and_resumes(tmp_path: 
     assert resumed == straight != first
 
 
+@pytest.mark.slow
 def test_a_learner_in_a_file_of_its_own_is_used_from_python(tmp_path: Path) -> None:
     (tmp_path / "nearsighted.py").write_text(NEARSIGHTED)
     program = """

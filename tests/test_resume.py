@@ -263,12 +263,13 @@ def kill_and_resume(start: Any, status: Any, path: Path, num_kills: int, rng: np
     return half_written
 
 
-def test_a_run_killed_ten_times_ends_with_the_same_bits(
-    processes: Processes, undisturbed: Path, tmp_path: Path
+@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_run_killed_again_and_again_ends_with_the_same_bits(
+    kills: int, processes: Processes, undisturbed: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "killed"
-    half = kill_and_resume(processes.start, processes.status, path, 10, np.random.default_rng(7))
-    print(f"{half} of 10 kills left a half-written checkpoint")
+    half = kill_and_resume(processes.start, processes.status, path, kills, np.random.default_rng(7))
+    print(f"{half} of {kills} kills left a half-written checkpoint")
     assert summary_of(path) == summary_of(undisturbed)
     assert clockless(path) == clockless(undisturbed)
 

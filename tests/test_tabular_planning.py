@@ -214,7 +214,7 @@ def backups_until_optimal(learner: Learner, seed: int, mdp: FiniteMDP) -> int:
 def test_prioritized_sweeping_needs_fewer_backups_than_dyna() -> None:
     mdp, policy = dyna_maze(), EpsilonGreedy(0.1)
     dyna, swept = [], []
-    for seed in range(9):
+    for seed in range(5):
         table, _ = new_table(mdp, RunOptions())
         dyna.append(backups_until_optimal(dyna_learner(table, policy, step_code(1.0, 1), 5, 0.0), seed, mdp))
         table, _ = new_table(mdp, RunOptions(initial_q=1.0))

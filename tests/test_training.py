@@ -143,3 +143,15 @@ def test_seeds_of_different_purposes_do_not_meet() -> None:
     assert len(seeds) == 1000 and all(0 <= seed < 2**31 for seed in seeds)
     assert seed_for(3, 1) == seed_for(3, 1)
     assert np.random.default_rng(seed_for(0, 1)).random() != np.random.default_rng(seed_for(0, 2)).random()
+
+
+def test_what_is_reported_of_values_is_in_the_units_of_the_environment(tmp_path: Path) -> None:
+    # A table's values and errors are linear in rewards, so that the scale of rewards changes no action and no return.
+    rows = {}
+    for scale in (1.0, 0.125):
+        train(corridor(reward_scale=scale, log_every=1, total_steps=60), tmp_path / str(scale))
+        rows[scale] = [row for row in read_metrics(tmp_path / str(scale)) if row["kind"] == "train"]
+    for one, eighth in zip(rows[1.0], rows[0.125], strict=True):
+        for name in ("max_q", "abs_td_error", "loss"):
+            assert eighth[name] == pytest.approx(one[name], rel=1e-4, abs=1e-6), name
+    assert max(row["max_q"] for row in rows[1.0]) > 0

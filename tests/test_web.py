@@ -12,6 +12,8 @@ import importlib.util
 import json
 import re
 import socket
+import threading
+import time
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -28,6 +30,7 @@ pytest.importorskip("starlette", reason="the extra web is not installed")
 pytest.importorskip("httpx", reason="starlette's test client needs httpx")
 from starlette.testclient import TestClient
 
+from neuralq.apps.web.play_tictactoe import tictactoe
 from neuralq.apps.web.pool import Left, Pool, TooLong
 
 STAR = {"problem": "baird", "gamma": 0.99, "step_size": 0.01, "method": "td", "sampling": "expected", "options": {}}
@@ -310,3 +313,82 @@ def test_a_public_address_is_warned_about(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(OSError):
         serve(port=taken.getsockname()[1])
+
+
+# ---- what a server meets that stands open
+
+
+PAGES = ["lab", "tictactoe"]
+
+
+@pytest.fixture(scope="module")
+def page(client: TestClient) -> Iterator[dict[str, tuple[TestClient, str]]]:
+    """A page's client, and a path that takes JSON."""
+    with TestClient(server.play_app(tictactoe()), base_url="http://127.0.0.1:8765") as play:
+        yield {"lab": (client, "/api/diagnose"), "tictactoe": (play, "/api/start")}
+
+
+@pytest.mark.parametrize("which", PAGES)
+@pytest.mark.parametrize(
+    "body",
+    [
+        '{"problem": "\\ud800"}', '{"\\udfff": 1}', '{"options": {"\\ud83d": 1}}', '{"a": [["x\\ude00y"]]}',
+    ],
+)  # fmt: skip
+def test_half_a_character_is_refused_wherever_it_stands(which: str, body: str, page: Any) -> None:
+    client, path = page[which]
+    reply = client.post(path, content=body, headers={"content-type": "application/json"})
+    assert reply.status_code == 400 and "half a surrogate pair" in reply.json()["error"]
+    whole = client.post(path, content='{"problem": "\\ud83d\\ude00"}', headers={"content-type": "application/json"})
+    assert whole.status_code == 422, "a pair is a character, which means nothing here"
+
+
+@pytest.mark.parametrize("which", PAGES)
+@pytest.mark.parametrize(
+    ("origin", "allowed"),
+    [
+        ("http://127.0.0.1:8765", True), ("https://127.0.0.1:8765", True), (None, True), ("http://evil.example", False),
+        ("null", False), ("http://127.0.0.1:8766", False), ("http://127.0.0.1", False),
+        ("http://localhost:8765", False),
+        ("http://127.0.0.1:8765.evil.example", False), ("", False),
+    ],
+)  # fmt: skip
+def test_pages_of_other_sites_get_no_answer(which: str, origin: str | None, allowed: bool, page: Any) -> None:
+    client, path = page[which]
+    headers = {} if origin is None else {"origin": origin}
+    for reply in (client.post(path, json={"no": "field"}, headers=headers), client.get("/", headers=headers)):
+        assert (reply.status_code in (200, 422)) == allowed and (reply.status_code == 403) != allowed
+
+
+def test_a_request_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("uvicorn")
+    from neuralq.apps.web import patience
+
+    monkeypatch.setattr(patience, "PATIENCE_SECONDS", 0.3)
+    found: list[str] = []
+    serving = {"title": "x", "announce": found.append}
+    threading.Thread(
+        target=lambda: server.serve_app(lambda: server.play_app(tictactoe()), "127.0.0.1", 0, **serving),  # type: ignore[arg-type]
+        daemon=True,
+    ).start()
+    while not found:
+        time.sleep(0.01)
+    port = int(found[0].rstrip("/").rpartition(":")[2])
+    start = f"POST /api/start HTTP/1.1\r\nhost: 127.0.0.1:{port}\r\ncontent-type: application/json\r\n"
+    for sent, more in (
+        ("", ""), (start, "x-more: 1\r\n"), (start + "content-length: 99\r\n\r\n{", " "),
+        (start + "content-length: 2\r\n\r\n{}GET / HTTP/1.1\r\nhost", "x"),
+    ):  # fmt: skip
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+            began = time.monotonic()
+            connection.sendall(sent.encode())
+            connection.settimeout(0.1)
+            closed = False
+            while not closed and time.monotonic() - began < 3:
+                try:
+                    closed = connection.recv(4096) == b""
+                except TimeoutError:
+                    connection.sendall(more.encode())  # a byte now and then
+                except ConnectionError:
+                    closed = True
+            assert closed and time.monotonic() - began < 1.5, (sent, more)

@@ -29,7 +29,7 @@ from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.exact.evaluation import policy_process
 from neuralq.exact.kernels import Floats
 from neuralq.exact.policies import best_rows
-from neuralq.exact.problem import PlanningProblem, prepare, q_of_rows
+from neuralq.exact.problem import PlanningProblem, default_tolerance, is_close_enough, prepare, q_of_rows
 from neuralq.mdp import FiniteMDP
 
 __all__ = ["AverageEvaluation", "AverageSolution", "evaluate_average", "solve_average"]
@@ -66,7 +66,8 @@ class AverageSolution:
         iterations: policies evaluated, or sweeps.
         bound: guaranteed error of the gain at every state; for policy iteration the residual of the two optimality
             equations, which is rounding.
-        converged: whether the bound is at most the tolerance asked for.
+        converged: whether the bound is at most the tolerance asked for, or at the floor of rounding and at most the
+            tolerance times the largest |gain|.
         seconds: wall-clock time.
     """
 
@@ -146,14 +147,15 @@ def _one_class(chain: sparse.csr_array, reward: Floats) -> tuple[float, Floats]:
 
 
 def solve_average(
-    mdp: FiniteMDP, method: str = "policy-iteration", tol: float = 1e-8, *, max_iterations: int = 100_000
+    mdp: FiniteMDP, method: str = "policy-iteration", tol: float | None = None, *, max_iterations: int = 100_000
 ) -> AverageSolution:
     """The largest average reward per step from every state, and a policy that attains it.
 
     Args:
         mdp: the model; an episode that ends rests at reward 0 for ever.
         method: ``"policy-iteration"`` (any model) or ``"relative-value-iteration"`` (large ones with one gain).
-        tol: largest error of the gain to accept.
+        tol: largest error of the gain to accept; default 1e-8, or a millionth of the largest |reward| where that is
+            less. Where rounding allows no less than ``tol``, ``tol`` times the largest |gain| is accepted.
         max_iterations: stop after so many, with ``converged=False``.
 
     Raises:
@@ -168,17 +170,20 @@ def solve_average(
         ([1.0, 5.0], True)
     """
     check_choice("method", method, ("policy-iteration", "relative-value-iteration"))
-    check_positive("tol", tol)
+    if tol is not None:
+        check_positive("tol", tol)
     check_whole("max_iterations", max_iterations)
     began = time.perf_counter()
     problem = prepare(mdp, 1.0)  # row discounts are chances to go on
     iterate = _policy_iteration if method == "policy-iteration" else _relative_value_iteration
+    tol = tol or default_tolerance(problem)
     rows, values, gain, iterations, bound = iterate(problem, tol, max_iterations)
     policy = np.where(mdp.is_terminal, -1, mdp.a_tm1[rows])
     found = evaluate_average(mdp, policy)
     multichain = len(np.unique(found.recurrent_class[found.recurrent_class >= 0])) > 1
     seconds = time.perf_counter() - began
-    return AverageSolution(gain, values, policy, multichain, iterations, bound, bound <= tol, seconds)
+    converged = is_close_enough(bound, tol, gain, problem.rounding(values))
+    return AverageSolution(gain, values, policy, multichain, iterations, bound, converged, seconds)
 
 
 def _policy_iteration(
@@ -193,7 +198,7 @@ def _policy_iteration(
         found = evaluate_average(mdp, policy)
         iterations += 1
         drift = q_of_rows(moves, found.gain)  # P g: where an action leads to, in gain
-        size = 1 + problem.largest_reward + float(np.abs(found.bias).max())
+        size = problem.largest_reward + float(np.abs(found.bias).max())
         tie = _TIE * size
         best_drift = drift[best_rows(problem, drift)]
         worth = q_of_rows(problem, found.bias) - found.gain[mdp.s_tm1]
@@ -227,11 +232,11 @@ def _relative_value_iteration(
         low, high = float(change.min()), float(change.max())
         if ends:  # where it rests nothing is earned
             low, high = min(low, 0.0), max(high, 0.0)
-        width = (high - low) / 2 + problem.rounding(v)
-        if width <= tol:
+        rounding = problem.rounding(v)
+        width, gain = (high - low) / 2 + rounding, np.full(mdp.num_states, (low + high) / 2)
+        if is_close_enough(width, tol, gain, rounding):
             break
         v = v + _TAU * change
         if not ends:
             v -= v[0]  # only differences matter, and they stay bounded
-    gain = np.full(mdp.num_states, (low + high) / 2)
     return rows, v, gain, iterations, width

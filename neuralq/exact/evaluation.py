@@ -3,7 +3,8 @@
     V_π = r_π + γ P_π V_π,   P_π(s, s') = Σ_a π(a|s) discount(s, a) P(s'|s, a),   r_π(s) = Σ_a π(a|s) r(s, a)
 
 (I − γ P_π) is factored by sparse LU. With γ = 1 the system has a solution only if the policy ends its episodes from
-every state; a policy that does not is refused, naming a state from which it never ends.
+every state, or brings them to states that no action leads out of to an end and where it earns nothing for ever: those
+are worth 0. A policy that does neither is refused, naming a state from which it never ends.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def evaluate(mdp: FiniteMDP, policy: ArrayLike, gamma: float) -> NDArray[np.floa
     check_discount("gamma", gamma)
     P_pi, r_pi = policy_process(mdp, policy)
     if gamma == 1:
-        _check_proper(mdp, P_pi)
+        P_pi = _ending(mdp, P_pi, r_pi)
     system = sparse.csc_array(sparse.eye_array(mdp.num_states) - gamma * P_pi)
     return np.asarray(splu(system).solve(r_pi), dtype=np.float64) + 0.0  # no -0.0 for readers to wonder at
 
@@ -120,16 +121,35 @@ def _row_probabilities(mdp: FiniteMDP, policy: NDArray[np.generic]) -> NDArray[n
     return np.asarray(table[mdp.s_tm1, mdp.a_tm1])
 
 
-def _check_proper(mdp: FiniteMDP, P_pi: sparse.csr_array) -> None:
-    """Every state reaches, against the arrows, one that may end."""
-    ends = np.asarray(P_pi.sum(axis=1)).reshape(-1) < 1 - 1e-9
-    leads_to = P_pi > 0
-    frontier = ends
+def _may_end(P_pi: sparse.csr_array) -> NDArray[np.bool_]:
+    return np.asarray(np.asarray(P_pi.sum(axis=1)).reshape(-1) < 1 - 1e-9)
+
+
+def _leading_to(P_pi: sparse.csr_array, goals: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """States from which, along the arrows, one of ``goals`` can be reached; the goals too."""
+    leads_to, found, frontier = P_pi > 0, goals, goals
     while frontier.any():
-        frontier = np.asarray(leads_to @ frontier.astype(np.int64) > 0) & ~ends
-        ends = ends | frontier
+        frontier = np.asarray(leads_to @ frontier.astype(np.int64) > 0) & ~found
+        found = found | frontier
+    return found
+
+
+def _ending(mdp: FiniteMDP, P_pi: sparse.csr_array, r_pi: NDArray[np.float64]) -> sparse.csr_array:
+    """P_π with an end in every state where it earns nothing for ever and no action could end the episode, if needed.
+
+    Raises:
+        ValueError: from some state no end is reached.
+    """
+    may_end = _may_end(P_pi)
+    ends = _leading_to(P_pi, may_end)
+    if ends.all():
+        return P_pi
+    anything, _ = policy_process(mdp, mdp.legal / np.maximum(1, mdp.legal.sum(axis=1, keepdims=True)))
+    at_rest = ~_leading_to(P_pi, r_pi != 0) & ~_leading_to(anything, _may_end(anything))
+    ends = _leading_to(P_pi, may_end | at_rest)
     if not ends.all():
         s = int(np.argmin(ends))
         raise ValueError(
             f"with gamma=1 the policy must end every episode, but from {mdp.state_name(s)} it never does; use gamma < 1"
         )
+    return sparse.csr_array(sparse.diags_array((~at_rest).astype(np.float64)) @ P_pi)

@@ -12,7 +12,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,17 @@ from neuralq.checks import check_choice, check_discount, check_positive, check_w
 from neuralq.exact.asynchronous import labelled_rtdp, prioritized_sweeping, rtdp
 from neuralq.exact.kernels import best_of_rows, spread
 from neuralq.exact.policies import linear_programming, policy_iteration
-from neuralq.exact.problem import Found, PlanningProblem, prepare, q_of_rows
+from neuralq.exact.problem import Found, PlanningProblem, default_tolerance, is_close_enough, prepare, q_of_rows
 from neuralq.exact.sweeping import gauss_seidel, modified_policy_iteration, value_iteration
 from neuralq.exact.undiscounted import (
     bellman_ford,
     certified,
+    ending_at_rest,
     episodic,
     is_shortest_path,
     path_rounding,
     proper_policy_iteration,
+    resting_rows,
 )
 from neuralq.mdp import FiniteMDP
 
@@ -60,12 +62,14 @@ class Solution:
         v: V* ``[S]``, 0 at terminal states.
         policy: an optimal action of every state, ``[S]``; -1 at terminal states. It is the lowest of those that may be
             optimal; with γ = 1 one that leads to an end; after an early stop the best so far.
-        optimal_actions: every action that may be optimal given the bound, ``[S, A]``. None that is optimal is missing.
+        optimal_actions: every action that may be optimal given the bound, ``[S, A]``. None that is optimal is missing;
+            where ``separated`` is False the bound is too wide to say that each of them is.
         iterations: sweeps, policies evaluated, pivots, trials, or as many backups as there are states, by method.
         backups: applications of the Bellman equation to one state-action pair.
         residual: ‖T V − V‖∞ of the last backup.
         bound: guaranteed ‖v − V*‖∞.
-        converged: whether the bound is at most the tolerance asked for.
+        converged: whether the bound is at most the tolerance asked for, or at the floor of rounding and at most the
+            tolerance times the largest |V|.
         seconds: wall-clock time.
         method: the method that found it.
     """
@@ -82,12 +86,17 @@ class Solution:
     seconds: float
     method: str
 
+    @property
+    def separated(self) -> NDArray[np.bool_]:
+        """Where ``optimal_actions`` is an answer, ``[S]``: one action is left, or all are optimal within ``tol``."""
+        return np.asarray((self.optimal_actions.sum(axis=1) <= 1) | self.converged)
+
 
 def solve(
     mdp: FiniteMDP,
     gamma: float,
     method: str = "auto",
-    tol: float = 1e-8,
+    tol: float | None = None,
     *,
     max_iterations: int | None = None,
     seed: int = 0,
@@ -98,11 +107,13 @@ def solve(
         mdp: the model.
         gamma: γ in [0, 1]. With 1 episodes must end: ``"auto"`` and ``"policy-iteration"`` need a policy that ends them
             from every state, and one that never does must earn less; other methods need that every policy ends them.
+            Where no end can be reached, but one can rest at reward 0 and earn nothing, V* is 0 (an absorbing goal).
         method: ``"value-iteration"``, ``"gauss-seidel"``, ``"policy-iteration"``, ``"modified-policy-iteration"``,
             ``"prioritized-sweeping"``, ``"linear-programming"``, ``"rtdp"``, ``"labelled-rtdp"``, ``"bellman-ford"``
             (deterministic with γ = 1 only), or ``"auto"``: Bellman–Ford where it applies, policy iteration for small
             models, modified policy iteration for large ones.
-        tol: largest ‖v − V*‖∞ to accept.
+        tol: largest ‖v − V*‖∞ to accept; default 1e-8, or a millionth of the largest |reward| where that is less.
+            Where rounding allows no less than ``tol``, ``tol`` times the largest |V| is accepted.
         max_iterations: stop after so many, with ``converged=False``; default: until nothing improves any more.
         seed: of the simulated trials of the two RTDP methods.
 
@@ -120,12 +131,19 @@ def solve(
     """
     check_discount("gamma", gamma)
     check_choice("method", method, METHODS)
-    check_positive("tol", tol)
+    if tol is not None:
+        check_positive("tol", tol)
     check_whole("seed", seed, minimum=0)
     if max_iterations is not None:
         check_whole("max_iterations", max_iterations)
     began = time.perf_counter()
     problem = prepare(mdp, gamma)
+    tol = tol or default_tolerance(problem)
+    resting = resting_rows(problem) if math.isinf(problem.reach) else np.empty(0, dtype=np.int64)
+    if resting.size:
+        ends = ending_at_rest(mdp, resting)
+        answer = solve(ends, gamma, method, tol, max_iterations=max_iterations, seed=seed)
+        return _with_rest(problem, resting, answer, began)
     chosen = _automatic(problem) if method == "auto" else method
     limit = math.inf if max_iterations is None else max_iterations
     if math.isinf(problem.reach) and chosen != "bellman-ford":
@@ -137,6 +155,22 @@ def solve(
     else:
         found = _SOLVERS[chosen](problem, tol, limit)
     return _proven(problem, found, tol, chosen, began)
+
+
+def _with_rest(problem: PlanningProblem, resting: NDArray[np.int64], answer: Solution, began: float) -> Solution:
+    """An answer for the model that ends at rest, told of the actions that there are at rest."""
+    mdp = problem.mdp
+    at_rest = np.zeros(mdp.num_states, dtype=bool)
+    at_rest[mdp.s_tm1[resting]] = True
+    values = q_of_rows(problem, answer.v)
+    rows = np.flatnonzero(at_rest[mdp.s_tm1])
+    s, a = mdp.s_tm1[rows], mdp.a_tm1[rows]
+    q, optimal, policy = answer.q.copy(), answer.optimal_actions.copy(), answer.policy.copy()
+    q[s, a] = values[rows]
+    optimal[s, a] = values[rows] >= -2 * (answer.bound + answer.residual)
+    policy[mdp.s_tm1[resting[::-1]]] = mdp.a_tm1[resting[::-1]]  # the last written is the lowest
+    seconds = time.perf_counter() - began
+    return replace(answer, q=q, optimal_actions=optimal, policy=policy, seconds=seconds)
 
 
 def _automatic(problem: PlanningProblem) -> str:
@@ -153,14 +187,16 @@ def _proven(problem: PlanningProblem, found: Found, tol: float, method: str, beg
     values = q_of_rows(problem, v)
     better, best_row = np.empty(mdp.num_states), np.empty(mdp.num_states, dtype=np.int64)
     least, largest = best_of_rows(rows, values, v, better, best_row)
-    residual = max(-least, largest, 0.0)
+    residual = max(-least, largest, 0.0) + 0.0
     if method == "bellman-ford":
-        bound = path_rounding(problem, v) if residual == 0 else math.inf
+        floor = path_rounding(problem, v)
+        bound = floor if residual == 0 else math.inf
     else:
         problem = certified(problem, v)
         down, up = problem.interval(least, largest)
-        bound = max(up, -down, 0.0) + problem.reach * problem.rounding(v)
-    converged = bound <= tol
+        floor = problem.reach * problem.rounding(v)
+        bound = max(up, -down, 0.0) + floor
+    converged = is_close_enough(bound, tol, v, floor)
     q, optimal = np.full((mdp.num_states, mdp.num_actions), np.nan), np.zeros((mdp.num_states, mdp.num_actions), bool)
     policy = np.empty(mdp.num_states, dtype=np.int64)
     # |q − Q*| ≤ ‖V − V*‖ ≤ bound + residual: an optimal action lies within twice that of the best.
@@ -176,6 +212,9 @@ def _proven(problem: PlanningProblem, found: Found, tol: float, method: str, beg
 def count_optimal_policies(answer: Solution) -> int:
     """How many deterministic policies take an optimal action in every state: Π_s |optimal actions of s|.
 
+    Raises:
+        ValueError: the bound does not separate the actions of some state.
+
     Source: Mitchell 1997, exercise 13.1.
 
     Example:
@@ -183,17 +222,31 @@ def count_optimal_policies(answer: Solution) -> int:
         >>> count_optimal_policies(solve(twins, gamma=0.5))
         2
     """
+    _check_separated(answer)
     return math.prod(int(n) for n in answer.optimal_actions.sum(axis=1) if n)
 
 
 def optimal_policies(answer: Solution) -> Iterator[NDArray[np.int64]]:
     """Every deterministic optimal policy ``[S]``, one after the other, -1 at terminal states; the last state first.
 
+    Raises:
+        ValueError: the bound does not separate the actions of some state.
+
     Example:
         >>> twins = FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[2.0, 2.0]])
         >>> [policy.tolist() for policy in optimal_policies(solve(twins, gamma=0.5))]
         [[0], [1]]
     """
+    _check_separated(answer)
     choices = [np.flatnonzero(row) if row.any() else np.array([-1]) for row in answer.optimal_actions]
     for policy in itertools.product(*choices):
         yield np.array(policy, dtype=np.int64)
+
+
+def _check_separated(answer: Solution) -> None:
+    if not answer.separated.all():
+        s = int(np.argmin(answer.separated))
+        raise ValueError(
+            f"which actions of state {s} are optimal is not known: the error of V may be as large as "
+            f"{answer.bound:.3g}; allow more iterations, or a larger tol"
+        )

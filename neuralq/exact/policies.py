@@ -27,6 +27,7 @@ __all__ = ["best_rows", "linear_programming", "policy_iteration", "policy_values
 _MOST_FACTORED = 3000  # states; beyond, the factors of a matrix without structure may not fit into memory
 _MOST_STEPS = 1e5  # expected steps up to which sweeps evaluate a policy in reasonable time
 _LARGEST_EVALUATION_SWEEPS = 1_000_000
+_LEAST_UNIT = 1e-3  # largest reward from which on, and up to its inverse, a linear program is solved as it stands
 
 
 def policy_iteration(
@@ -104,13 +105,21 @@ def linear_programming(problem: PlanningProblem, tol: float, limit: float) -> Fo
     chooses = sparse.csr_array((np.ones(mdp.num_rows), (every_row, mdp.s_tm1)), shape=mdp.transition.shape)
     constraints = sparse.diags_array(rows.decay) @ mdp.transition - chooses
     options = {} if limit == np.inf else {"maxiter": int(limit)}
+    # Its tolerances are absolute: rewards much smaller than 1 would all be within them. A power of two rounds nothing.
+    unit = 1.0 if _LEAST_UNIT <= problem.largest_reward <= 1 / _LEAST_UNIT else problem.largest_reward or 1.0
+    unit = 2.0 ** math.floor(math.log2(unit))
     free = np.stack([np.where(problem.acts, -np.inf, 0.0), np.where(problem.acts, np.inf, 0.0)], axis=1)
     result = linprog(
-        np.ones(mdp.num_states), A_ub=constraints, b_ub=-rows.reward, bounds=free, method="highs", options=options
+        np.ones(mdp.num_states),
+        A_ub=constraints,
+        b_ub=-rows.reward / unit,
+        bounds=free,
+        method="highs",
+        options=options,
     )
     iterations = int(result.nit or 0)
     if result.x is None or result.ineqlin.marginals is None:  # stopped before it had anything
         return Found(np.zeros(mdp.num_states), iterations, 0)
     occupied = -np.asarray(result.ineqlin.marginals)
-    v, _, sweeps = policy_values(problem, best_rows(problem, occupied), np.asarray(result.x, dtype=np.float64))
+    v, _, sweeps = policy_values(problem, best_rows(problem, occupied), unit * np.asarray(result.x, dtype=np.float64))
     return Found(v, iterations, sweeps * int(problem.acts.sum()))

@@ -22,7 +22,20 @@ from scipy import sparse
 from neuralq.exact.kernels import Floats, Rows, look_ahead
 from neuralq.mdp import FiniteMDP
 
-__all__ = ["Found", "PlanningProblem", "prepare", "q_of_rows", "rows_of", "trapped_rows"]
+__all__ = [
+    "Found",
+    "PlanningProblem",
+    "default_tolerance",
+    "is_close_enough",
+    "prepare",
+    "q_of_rows",
+    "rows_of",
+    "trapped_rows",
+]
+
+
+_NEAR_FLOOR = 16.0
+_TOL, _TOL_OF_REWARD = 1e-8, 1e-6
 
 
 class Found(NamedTuple):
@@ -63,8 +76,8 @@ class PlanningProblem:
 
     @property
     def uniform(self) -> bool:
-        """Whether every row goes on with the same modulus: then a constant error is known exactly, and removed."""
-        return abs((1 - self.least_modulus) * self.reach - 1) < 1e-9
+        """Whether all rows go on with one modulus, but for rounding: then a constant error is known, and removed."""
+        return abs((1 - self.least_modulus) * self.reach - 1) < 1e-6  # rounding of the modulus, times a reach of 10⁹
 
     def rounding(self, v: Floats) -> float:
         """What rounding can do to one backup: each of its sums is off by half a unit in the last place."""
@@ -78,6 +91,21 @@ class PlanningProblem:
         up = sure * largest if largest <= 0 else (self.reach - 1) * largest
         down = sure * least if least >= 0 else (self.reach - 1) * least
         return down, up
+
+
+def default_tolerance(problem: PlanningProblem) -> float:
+    """1e-8, or a millionth of the largest |reward| where that is less: the unit of rewards must not decide alone."""
+    return min(_TOL, _TOL_OF_REWARD * problem.largest_reward) or _TOL
+
+
+def is_close_enough(bound: float, tol: float, v: Floats, floor: float) -> bool:
+    """Whether a bound is what was asked for: ``tol``, or where rounding allows no less, ``tol`` times the largest |v|.
+
+    ``floor`` is the bound that rounding leaves. A method that ends within a small factor of it has done what can be
+    done, and whether that is enough must not depend on the unit in which rewards are counted.
+    """
+    near = _NEAR_FLOOR * floor
+    return bool(bound <= tol or bound <= near <= tol * float(np.abs(v).max()))
 
 
 def rows_of(mdp: FiniteMDP, gamma: float) -> Rows:
@@ -107,14 +135,18 @@ def prepare(mdp: FiniteMDP, gamma: float) -> PlanningProblem:
     return PlanningProblem(mdp, gamma, rows, acts, reach, least, longest, size)
 
 
-def trapped_rows(problem: PlanningProblem) -> NDArray[np.int64]:
+def trapped_rows(problem: PlanningProblem, among: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
     """Rows by which some policy stays for ever without discount: those of the largest set that need not be left.
+
+    With ``among`` (a mask of rows) only these are taken.
 
     Each of them loses nothing and leads only to states that have such a row (the maximal end components, de Alfaro
     1997). Empty iff every policy ends its episodes.
     """
     mdp = problem.mdp
     loses_nothing = problem.rows.decay * mdp.row_mass >= 1 - 1e-9
+    if among is not None:
+        loses_nothing &= among
     pattern = sparse.csr_array(
         ((mdp.transition.data > 0).astype(np.float64), mdp.transition.indices, mdp.transition.indptr),
         shape=mdp.transition.shape,

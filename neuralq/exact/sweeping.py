@@ -10,6 +10,7 @@
   left is small beside that of the policy (Puterman & Shin 1978). An action gives way only to a strictly better one.
 
 Each stops when what it has is proven good enough, or when sweeps no longer help because rounding is all that is left.
+Whatever the exit, the constant is taken out: at the floor of rounding the span says nothing about its size.
 """
 
 from __future__ import annotations
@@ -34,27 +35,64 @@ from neuralq.exact.problem import Found, PlanningProblem
 __all__ = ["PolicyMatrix", "gauss_seidel", "modified_policy_iteration", "value_iteration"]
 
 
-_PATIENCE = 20  # errors shrink by the modulus; one that finds no new low for so long is at the floor of rounding
+_PATIENCE = 20  # spans shrink fast; one that finds no new low for so long is at the floor of rounding
+_LONGEST_PATIENCE = 100_000
+_MOST_SHIFTS = (
+    4  # how often the constant is taken out at the floor: each time what is left of it is rounding of the last
+)
 _WORTH_COPYING = 0.2  # share of rows that are far enough below the best
 _INNER_SHARE = 0.001  # an evaluation stops when its error is so much smaller than the policy's
 _MOST_INNER_SWEEPS = 200
 
 
 class _Progress:
-    """Whether the error still falls."""
+    """Whether the error still falls.
 
-    def __init__(self) -> None:
+    A span has no rate that is known. Other errors shrink by 1 − 1/reach at least, so for 1/reach of their size to show
+    above rounding it takes up to ``reach`` sweeps.
+    """
+
+    def __init__(self, problem: PlanningProblem, *, span: bool) -> None:
         self._best, self._stalled = np.inf, 0
+        self._patience = _PATIENCE if span else max(_PATIENCE, min(problem.reach, _LONGEST_PATIENCE))
 
     def stalls(self, error: float) -> bool:
         self._stalled = 0 if error < self._best else self._stalled + 1
         self._best = min(self._best, error)
-        return self._stalled > _PATIENCE
+        return self._stalled > self._patience
+
+
+class _Constant:
+    """Takes the constant error out of values, where rows go on with one modulus; says when there is no more to do."""
+
+    def __init__(self, problem: PlanningProblem, tol: float) -> None:
+        self._problem, self._tol, self._shifts = problem, tol, 0
+        self._progress = _Progress(problem, span=problem.uniform)
+
+    def settles(self, v: Floats, least: float, largest: float, *, last: bool) -> bool:
+        """Whether ``v = T V`` is as good as asked for, or as sweeps can make it; ``last`` if no sweep is left."""
+        problem = self._problem
+        down, up = problem.interval(least, largest)
+        error = (up - down) / 2 if problem.uniform else max(up, -down, 0.0)
+        floor = problem.reach * problem.rounding(v)
+        enough = error + floor <= self._tol
+        stalls = not enough and (self._progress.stalls(error) or error <= floor)
+        if not (enough or stalls or last):
+            return False
+        if not problem.uniform:
+            return True
+        shift = (up + down) / 2
+        v[problem.acts] += shift
+        if not stalls or self._shifts == _MOST_SHIFTS or abs(shift) <= floor:
+            return True
+        self._shifts += 1
+        self._progress = _Progress(problem, span=True)
+        return False
 
 
 def value_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """V ← T V until V* is known within ``tol``."""
-    rows, progress = problem.rows, _Progress()
+    rows, constant = problem.rows, _Constant(problem, tol)
     v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
     iterations, backups, slack, before = 0, 0, np.inf, np.inf
     budget = np.inf  # how far values may move apart until a row that was left out can be the best
@@ -64,8 +102,7 @@ def value_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found
         least, largest, beaten = sweep(rows, v, better, slack + rounding)
         v, better = better, v
         iterations, backups = iterations + 1, backups + len(rows.reward)
-        error, allowance = _settle(problem, v, least, largest, tol)
-        if error + allowance <= tol or progress.stalls(error):
+        if constant.settles(v, least, largest, last=iterations >= limit):
             break
         drift = _drift(problem, least, largest)
         budget -= drift
@@ -93,18 +130,6 @@ def _further_drift(problem: PlanningProblem, drift: float, before: float) -> flo
     return 1.5 * drift * rate / (1 - rate)
 
 
-def _settle(problem: PlanningProblem, v: Floats, least: float, largest: float, tol: float) -> tuple[float, float]:
-    """The proven error of ``v = T V``, and that of rounding; at the end a constant error, where known, is removed."""
-    down, up = problem.interval(least, largest)
-    error = (up - down) / 2 if problem.uniform else max(up, -down, 0.0)
-    if error > tol:
-        return error, 0.0  # rounding does not matter yet
-    allowance = problem.reach * problem.rounding(v)
-    if problem.uniform and error + allowance <= tol:
-        v[problem.acts] += (up + down) / 2
-    return error, allowance
-
-
 def _surviving(rows: Rows, v: Floats, slack: float) -> Rows:
     """The rows that may still be optimal."""
     q, kind = np.empty(len(rows.reward)), rows.starts.dtype
@@ -127,7 +152,7 @@ def _surviving(rows: Rows, v: Floats, slack: float) -> Rows:
 
 def gauss_seidel(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """V(s) ← (T V)(s), state by state, until V* is known within ``tol``."""
-    rows, progress = problem.rows, _Progress()
+    rows, progress = problem.rows, _Progress(problem, span=False)
     v, scratch = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
     iterations, backups = 0, 0
     while iterations < limit:
@@ -141,7 +166,7 @@ def gauss_seidel(problem: PlanningProblem, tol: float, limit: float) -> Found:
             down, up = problem.interval(least, largest)
             if max(up, -down, 0.0) + allowance <= tol or change == 0:
                 break
-        if progress.stalls(change):
+        if progress.stalls(change) or change <= problem.rounding(v):
             break
     return Found(v, iterations, backups)
 
@@ -184,7 +209,7 @@ class PolicyMatrix:
 
 def modified_policy_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """A sweep of improvement, then sweeps of the policy alone, until V* is known within ``tol``."""
-    rows, progress = problem.rows, _Progress()
+    rows, constant = problem.rows, _Constant(problem, tol)
     v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
     best_row = rows.starts[:-1].copy()
     iterations, backups = 0, 0
@@ -192,8 +217,7 @@ def modified_policy_iteration(problem: PlanningProblem, tol: float, limit: float
         least, largest = improve(rows, v, better, best_row)
         v, better = better, v
         iterations, backups = iterations + 1, backups + len(rows.reward)
-        error, allowance = _settle(problem, v, least, largest, tol)
-        if error + allowance <= tol or progress.stalls(error):
+        if constant.settles(v, least, largest, last=iterations >= limit):
             break
         policy = PolicyMatrix(problem, best_row)
         change = largest - least if problem.uniform else max(largest, -least)

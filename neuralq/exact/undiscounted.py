@@ -18,13 +18,25 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from neuralq.exact.kernels import Floats, improve
 from neuralq.exact.policies import policy_iteration
 from neuralq.exact.problem import Found, PlanningProblem, prepare, q_of_rows, trapped_rows
 from neuralq.mdp import FiniteMDP
 
-__all__ = ["bellman_ford", "certified", "episodic", "is_shortest_path", "path_rounding", "proper_policy_iteration"]
+__all__ = [
+    "bellman_ford",
+    "certified",
+    "ending_at_rest",
+    "episodic",
+    "is_shortest_path",
+    "path_rounding",
+    "proper_policy_iteration",
+    "resting_rows",
+]
+
+_DISCOUNT = "use gamma < 1 with method='auto'"
 
 
 def episodic(problem: PlanningProblem, method: str) -> PlanningProblem:
@@ -38,6 +50,7 @@ def episodic(problem: PlanningProblem, method: str) -> PlanningProblem:
         return replace(problem, reach=_most_steps(problem, np.ones(problem.mdp.num_rows, dtype=bool)))
     if method == "policy-iteration":
         return problem
+    proper_policy_iteration(problem, 1.0, math.inf)  # the way out must work, and says so itself where it does not
     raise ValueError(
         f"gamma={problem.gamma} does not contract: {problem.mdp.row_name(int(trapped[0]))} can be repeated for ever "
         "in an episode that never ends; use gamma < 1 or method='policy-iteration'"
@@ -60,6 +73,15 @@ def proper_policy_iteration(problem: PlanningProblem, tol: float, limit: float) 
 
 def _proper_policy(problem: PlanningProblem) -> NDArray[np.int64]:
     """A row for every state that leads, with positive probability, one step closer to an end."""
+    policy, reached = _ways_to_an_end(problem)
+    if not reached.all():
+        state = problem.mdp.state_name(int(np.argmin(reached)))
+        raise ValueError(f"gamma=1 needs episodes that end, but no policy ends one from {state}; use gamma < 1")
+    return policy
+
+
+def _ways_to_an_end(problem: PlanningProblem) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """A row that leads one step closer to an end, and whether there is one, ``[S]`` each."""
     mdp = problem.mdp
     follow = problem.rows.decay * (mdp.transition @ problem.acts.astype(np.float64))
     closer = follow < 1 - 1e-9
@@ -72,10 +94,36 @@ def _proper_policy(problem: PlanningProblem) -> NDArray[np.int64]:
         policy[mdp.s_tm1[rows]] = rows
         reached[mdp.s_tm1[rows]] = True
         closer = mdp.transition @ (reached & problem.acts).astype(np.float64) > 0
-    if not reached.all():
-        state = mdp.state_name(int(np.argmin(reached)))
-        raise ValueError(f"gamma=1 needs episodes that end, but no policy ends one from {state}; use gamma < 1")
-    return policy
+    return policy, reached
+
+
+def resting_rows(problem: PlanningProblem) -> NDArray[np.int64]:
+    """Rows of reward 0 by which a policy rests for ever where no end can be reached, and nothing better can be had.
+
+    From their states no reward above 0 can be reached either, so to rest is optimal there and V* = 0: for planning,
+    such a state is an end. The usual grid whose goals lead to themselves at reward 0 is the plainest case.
+    """
+    mdp = problem.mdp
+    _, ends = _ways_to_an_end(problem)
+    gains = np.zeros(mdp.num_states, dtype=bool)
+    gains[mdp.s_tm1[mdp.reward > 0]] = True
+    while True:
+        more = gains.copy()
+        more[mdp.s_tm1[mdp.transition @ gains.astype(np.float64) > 0]] = True
+        if np.array_equal(more, gains):
+            break
+        gains = more
+    return trapped_rows(problem, (mdp.reward == 0) & ~(ends | gains)[mdp.s_tm1])
+
+
+def ending_at_rest(mdp: FiniteMDP, resting: NDArray[np.int64]) -> FiniteMDP:
+    """The model in which every row of the states of ``resting`` rows ends the episode; rows keep their numbers."""
+    at_rest = np.zeros(mdp.num_states, dtype=bool)
+    at_rest[mdp.s_tm1[resting]] = True
+    goes_on = sparse.diags_array((~at_rest[mdp.s_tm1]).astype(np.float64))
+    transition = sparse.csr_array(goes_on @ mdp.transition)
+    transition.eliminate_zeros()
+    return replace(mdp, transition=transition, outcomes=None)
 
 
 def certified(problem: PlanningProblem, v: Floats) -> PlanningProblem:
@@ -84,7 +132,7 @@ def certified(problem: PlanningProblem, v: Floats) -> PlanningProblem:
         return problem
     gap = v[problem.mdp.s_tm1] - q_of_rows(problem, v)
     error = 2 * (float(np.max(-gap, initial=0.0)) + problem.rounding(v))
-    near = gap <= max(1e-7 * (1 + float(np.abs(v).max())), error)
+    near = gap <= max(1e-7 * (problem.largest_reward + float(np.abs(v).max())), error)
     covered = np.zeros(problem.mdp.num_states, dtype=bool)
     covered[problem.mdp.s_tm1[near]] = True
     if not covered[problem.acts].all():
@@ -151,7 +199,7 @@ def bellman_ford(problem: PlanningProblem, tol: float, limit: float) -> Found:
         return Found(np.where(np.isfinite(v), v, 0.0), iterations, iterations * mdp.num_rows)
     if np.isneginf(v).any():
         state = mdp.state_name(int(np.argmin(v)))
-        raise ValueError(f"gamma=1 needs episodes that end, but no path leads to an end from {state}; use gamma < 1")
+        raise ValueError(f"gamma=1 needs episodes that end, but no path leads to an end from {state}; {_DISCOUNT}")
     return Found(v, iterations, iterations * mdp.num_rows, best_row.astype(np.int64))
 
 
@@ -176,4 +224,4 @@ def _earning_cycle(problem: PlanningProblem, best_row: NDArray[np.unsignedintege
     cycle = path[path.index(s) :]
     names = " → ".join(problem.mdp.state_name(state) for state in [*cycle, s])
     earned = sum(float(problem.mdp.reward[int(best_row[state])]) for state in cycle)
-    return f"the cycle {names} earns {earned:g} each time round, so with gamma=1 values are infinite; use gamma < 1"
+    return f"the cycle {names} earns {earned:g} each time round, so with gamma=1 values are infinite; {_DISCOUNT}"

@@ -18,7 +18,9 @@ from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.jit import kernel, reassociating_kernel
 from neuralq.types import Array
 
-__all__ = ["FlatOptimiser", "Optimiser", "clip_norm_"]
+__all__ = ["FlatOptimiser", "Optimiser", "clip_norm_", "clip_norm_on_device_"]
+
+_LEAST_NORM = 1e-15  # below, squares begin to vanish in float32
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ def _moments_kernel(
         for i in range(p.size):
             m[i] = c1 * m[i] + n1 * g[i]
             v[i] = c2 * v[i] + n2 * g[i] * g[i]
-            p[i] -= step * m[i] / (np.sqrt(v[i]) * scale + small)
+            moved = p[i] - step * m[i] / (np.sqrt(v[i]) * scale + small)
+            p[i] = moved if v[i] < np.inf else p.dtype.type(np.nan)  # a square that overflows would stop it for ever
 
 
 @reassociating_kernel
@@ -84,6 +87,8 @@ def _scale(g: Array, factor: float) -> None:
 def clip_norm_(grad: Tensor | Array, max_norm: float) -> None:
     """Scale ``grad``, a tensor or an array, in place so that its Euclidean norm is at most ``max_norm``.
 
+    Squares that overflow or vanish are taken of the gradient over its largest entry; what is not finite becomes NaN.
+
     Example:
         >>> g = torch.tensor([3.0, 4.0])
         >>> clip_norm_(g, 1.0)
@@ -93,10 +98,43 @@ def clip_norm_(grad: Tensor | Array, max_norm: float) -> None:
     if not isinstance(grad, Tensor) or grad.device.type == "cpu":
         array = grad.numpy() if isinstance(grad, Tensor) else grad
         norm = math.sqrt(_square_sum(array))
-        if norm > max_norm:
+        if not _LEAST_NORM < norm < math.inf:
+            _clip_scaled_(array, max_norm)
+        elif norm > max_norm:
             _scale(array, max_norm / norm)
         return
-    grad.mul_(torch.clamp(max_norm / torch.linalg.vector_norm(grad), max=1.0))
+    clip_norm_on_device_(grad, max_norm)
+
+
+def clip_norm_on_device_(grad: Tensor, max_norm: float) -> None:
+    """As `clip_norm_`, by tensor expressions that wait for no device.
+
+    Example:
+        >>> g = torch.tensor([3e19, 4e19])
+        >>> clip_norm_on_device_(g, 10.0)
+        >>> g.tolist()
+        [6.0, 8.0]
+    """
+    norm, largest = torch.linalg.vector_norm(grad), grad.abs().amax()
+    usual = (norm > _LEAST_NORM) & torch.isfinite(norm)
+    unit = torch.where(usual | (largest == 0), torch.ones_like(largest), largest)
+    grad.div_(unit)  # by 1, but for the extremes
+    norm = torch.where(usual, norm, torch.linalg.vector_norm(grad))
+    grad.mul_(torch.minimum(max_norm / norm, unit))
+
+
+def _clip_scaled_(g: Array, max_norm: float) -> None:
+    """As `clip_norm_`, where the plain sum of squares is not to be trusted."""
+    largest = float(np.abs(g).max())
+    if largest == 0:
+        return
+    with np.errstate(invalid="ignore"):  # infinity over infinity
+        wide = g.astype(np.float64) / largest
+    norm = math.sqrt(float(np.sum(wide * wide)))
+    if not norm < math.inf:
+        g[:] = np.nan
+    elif largest * norm > max_norm:
+        g[:] = wide * (max_norm / norm)
 
 
 class FlatOptimiser:
@@ -143,7 +181,9 @@ class FlatOptimiser:
         if plain:
             self.values.add_(self._m, alpha=-rate)
         else:
-            self.values.addcdiv_(self._m, (self._v.sqrt() * root).add_(eps), value=-rate)
+            spread = (self._v.sqrt() * root).add_(eps)
+            spread = torch.where(spread == math.inf, math.nan, spread)  # as in the kernel
+            self.values.addcdiv_(self._m, spread, value=-rate)
 
     def _scales(self, learning_rate: float) -> tuple[float, float, float, bool]:
         """Step, factor of √v, ε and whether √v is left out, so that p −= step·m/(factor·√v + ε)."""

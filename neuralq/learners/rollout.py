@@ -6,6 +6,7 @@ returns cut λ at exploring actions. Values are computed once per rollout, with 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +79,8 @@ class RolloutSettings:
             check_whole(name, getattr(self, name))
         check_positive("learning_rate", self.learning_rate)
         Optimiser(self.optimiser)
+        if self.max_grad_norm is not None:
+            check_positive("max_grad_norm", self.max_grad_norm)
         if self.target_period_updates is not None:
             check_whole("target_period_updates", self.target_period_updates)
         check_fraction("anneal_to", self.anneal_to)
@@ -105,7 +108,8 @@ class RolloutLearner:
         settings: how to learn.
         rng: draws the minibatches.
         reward_scale: rewards are multiplied by it, so values are too.
-        total_updates: rollouts over which the learning rate falls; None for a constant one.
+        total_updates: rollouts without a gap over which the learning rate falls; None for a constant one. Steps count:
+            where environments wait for their reset, more rollouts hold as many.
 
     Example:
         >>> from neuralq.q import TableQ
@@ -139,7 +143,8 @@ class RolloutLearner:
         if settings.average_updates is not None:
             window = settings.average_updates * settings.num_epochs * settings.num_minibatches
             self._average = IterateAverage(engine.flat.values, window)
-        self._parts = {"descent": self._descent, "average": self._average}
+        self._num_steps = torch.zeros((), dtype=torch.int64)  # environment steps learned from
+        self._parts = {"descent": self._descent, "average": self._average, "num_steps": self._num_steps}
         if settings.target_period_updates is not None:
             engine.sync_target()
 
@@ -165,7 +170,9 @@ class RolloutLearner:
         errors = picked = targets
         annealed = 1.0
         if self.total_updates is not None:
-            annealed = max(self.settings.anneal_to, 1.0 - self.num_updates / self.total_updates)
+            before = int(self._num_steps) / len(targets)  # in rollouts
+            annealed = max(self.settings.anneal_to, 1.0 - before / self.total_updates)
+        self._num_steps += num_rows
         for epoch in range(self.settings.num_epochs):
             if epoch > 0 and self.settings.refresh_targets:
                 targets = self.targets(transition).reshape(-1)
@@ -201,7 +208,12 @@ class RolloutLearner:
 
     begin_streams = state.begin_streams
     state_dict = state.state_dict
-    load_state_dict = state.load_state_dict
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`, bit for bit; before 0.4 steps were not counted apart from rollouts."""
+        rows = self.settings.num_envs * self.settings.num_steps
+        steps = torch.tensor(int(state_dict["num_updates"]) * rows)
+        state.load_state_dict(self, {"num_steps": steps, **state_dict})
 
 
 def _build(parts: Parts) -> RolloutLearner:

@@ -19,10 +19,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from neuralq.checks import check_whole
+from neuralq.mdp.comparison import changing_wrapper, difference
 from neuralq.mdp.environment import ModelEnv, ModelVectorEnv
 from neuralq.mdp.outcomes import Outcomes, short_sum
 from neuralq.mdp.sources import garnet_rows, outcomes_of_functions
@@ -30,6 +32,7 @@ from neuralq.mdp.sources import garnet_rows, outcomes_of_functions
 __all__ = ["FiniteMDP"]
 
 _LARGEST_INDEX = np.iinfo(np.int32).max
+_UNCHECKED = "leave out the option or wrapper that changes it, or take the model as it stands (check=False, --no-check)"
 _SUM_TOLERANCE = 1e-9  # a row may miss 1 by this much: what decimal probabilities leave behind
 
 
@@ -270,14 +273,20 @@ class FiniteMDP:
         return mdp
 
     @classmethod
-    def from_gymnasium(cls, env: gymnasium.Env[Any, Any]) -> FiniteMDP:
+    def from_gymnasium(cls, env: gymnasium.Env[Any, Any], *, check: bool = True) -> FiniteMDP:
         """The model inside a Gymnasium environment: its ``mdp()``, or its table ``P[s][a] = [(p, s', r, terminated)]``.
 
         Transitions flagged as terminated give missing mass. The start distribution is ``initial_state_distrib`` where
         the environment has one, else uniform.
 
+        Args:
+            env: the environment, which is not touched.
+            check: whether a few thousand steps of a copy of it are compared with the table first. A table may lack what
+                its environment does besides, and a wrapper changes one and not the other; a time limit is no
+                difference, but the values are those without it.
+
         Raises:
-            ValueError: the environment has neither, or its table is not a valid model.
+            ValueError: the environment has neither, its table is not a valid model, or its steps are not the table's.
 
         Example:
             >>> FiniteMDP.from_gymnasium(gymnasium.make("FrozenLake-v1")).num_rows
@@ -286,6 +295,11 @@ class FiniteMDP:
         inner = env.unwrapped
         if callable(getattr(inner, "mdp", None)):
             model: FiniteMDP = inner.mdp()  # type: ignore[attr-defined]
+            wrapper = changing_wrapper(env)
+            if check and wrapper is not None:
+                raise ValueError(
+                    f"the wrapper {wrapper} may change what {inner} does, unknown to its model; {_UNCHECKED}"
+                )
             return model
         table = getattr(inner, "P", None)
         if table is None:
@@ -293,13 +307,27 @@ class FiniteMDP:
                 f"{inner} has no transition table: its unwrapped environment needs P[s][a], a list of "
                 "(probability, next state, reward, terminated), or a method mdp()"
             )
-        num_states, num_actions = int(inner.observation_space.n), int(inner.action_space.n)  # type: ignore[attr-defined]
+        if not isinstance(inner.observation_space, Discrete) or not isinstance(inner.action_space, Discrete):
+            raise ValueError(
+                f"{inner} has a table, but its observations are {inner.observation_space} and its actions "
+                f"{inner.action_space}; a table needs states and actions that are numbers, Discrete(n)"
+            )
+        num_states, num_actions = int(inner.observation_space.n), int(inner.action_space.n)
         start = getattr(inner, "initial_state_distrib", None)
 
         def actions(s: int) -> Iterable[int]:
             return range(num_actions) if not hasattr(table[s], "keys") else sorted(table[s].keys())
 
-        return cls.from_functions(num_states, num_actions, actions, lambda s, a: table[s][a], start=start)
+        try:
+            mdp = cls.from_functions(num_states, num_actions, actions, lambda s, a: table[s][a], start=start)
+        except (KeyError, IndexError) as error:
+            raise ValueError(
+                f"the table of {inner} has no entry {error}; it needs P[s][a] for every state of 0..{num_states - 1}"
+            ) from error
+        found = difference(env, mdp, start) if check else None
+        if found is not None:
+            raise ValueError(f"{inner} does not do what its table says: {found}; {_UNCHECKED}")
+        return mdp
 
     @classmethod
     def from_functions(

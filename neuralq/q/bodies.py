@@ -10,8 +10,8 @@ with variance 2/fan_in below an activation and 1/fan_in in the last layer, biase
 ``sparsity`` that fraction of the inputs of every unit starts at zero and all biases do (Elsayed, Vasan & Mahmood 2024),
 which keeps units apart where steps are large and there is no replay.
 
-Frames come as ``[H, W, C]``, ``[C, H, W]`` or ``[H, W]`` and are stored that way; `Conv` finds out, or is told, where
-the channels are, and turns them inside the network.
+Frames come as ``[H, W, C]``, ``[C, H, W]`` or ``[H, W]``, or as a stack ``[K, …]`` of frames with three axes, and are
+stored that way; `Conv` finds out, or is told, where the channels are, and turns them inside the network.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.function
 
 
 _INITS = ("uniform", "he")
+_SQUARABLE = 1e-15  # entries up to its inverse are squared and summed in float32 without a thought
 _HE, _LAST = 2.0, 1.0  # times 1/fan_in: rectified units halve the variance, and above the last layer there are none
 
 
@@ -106,19 +107,26 @@ class GroupedLayerNorm(nn.Module):
         shape: normalised shape of one copy.
         dtype: of scale and shift.
         affine: whether there are a scale and a shift to learn.
+        first: whether what comes in is of any size. What float32 cannot square is scaled before: a variance that
+            overflows would make a constant of it.
     """
 
     weight: nn.Parameter | None
     bias: nn.Parameter | None
 
-    def __init__(self, copies: int, shape: tuple[int, ...], dtype: torch.dtype, affine: bool = True) -> None:
+    def __init__(
+        self, copies: int, shape: tuple[int, ...], dtype: torch.dtype, affine: bool = True, *, first: bool = False
+    ) -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.first = shape, first
         self.weight = nn.Parameter(torch.ones(copies, *shape, dtype=dtype)) if affine else None
         self.bias = nn.Parameter(torch.zeros(copies, *shape, dtype=dtype)) if affine else None
 
     def forward(self, x: Tensor) -> Tensor:
         """``[copies, B, *shape] -> [copies, B, *shape]``."""
+        if self.first:  # the mean and spread of x / 1 are those of x, bit for bit
+            axes = tuple(range(-len(self.shape), 0))
+            x = x / (x.detach().abs().amax(axes, keepdim=True) * _SQUARABLE).clamp(min=1.0)
         hat = nn.functional.layer_norm(x, self.shape)
         return hat if self.weight is None or self.bias is None else hat * self.weight[:, None] + self.bias[:, None]
 
@@ -140,7 +148,7 @@ class Trunk(nn.Module):
             gain = None if body.init == "uniform" else _HE if i < len(sizes) - 2 else _LAST
             layers.append(GroupedLinear(copies, below, above, rng, dtype, body.sparsity, gain))
             if body.layer_norm and i < len(sizes) - 2:
-                norms.append(GroupedLayerNorm(copies, (above,), dtype, body.affine))
+                norms.append(GroupedLayerNorm(copies, (above,), dtype, body.affine, first=i == 0))
         self.layers = nn.ModuleList(layers)
         self.norms = nn.ModuleList(norms)
 
@@ -157,7 +165,8 @@ class Trunk(nn.Module):
 class GroupedConv(nn.Module):
     """``copies`` stacks of valid convolutions side by side, grouped: ``[B, *frame] -> [copies, B, d]``.
 
-    The frame's axes are ``[C, H, W]``, ``[H, W, C]`` or ``[H, W]``; ``in_shape`` is what the first convolution takes.
+    The frame's axes are ``[C, H, W]``, ``[H, W, C]`` or ``[H, W]``, or a stack of the first two; ``in_shape`` is what
+    the first convolution takes.
     """
 
     def __init__(
@@ -170,7 +179,9 @@ class GroupedConv(nn.Module):
         self.in_shape = channels_first(in_shape, body.channel_order)
         self.frame_shape = tuple(in_shape)
         # By the order given, not by the shape alone: all three sides may be equal.
-        self.channels_last = body.channel_order == "last" or self.in_shape != self.frame_shape
+        single = self.frame_shape[-3:]
+        auto_last = len(single) == 3 and channels_first(single, body.channel_order) != single
+        self.channels_last = body.channel_order == "last" or auto_last
         channels, height, width = self.in_shape
         gain = None if body.init == "uniform" else _HE
         weights: list[nn.Parameter] = []
@@ -185,7 +196,7 @@ class GroupedConv(nn.Module):
             weights.append(weight)
             biases.append(bias)
             if body.layer_norm:
-                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine))
+                norms.append(GroupedLayerNorm(copies, (fan_out, height, width), dtype, body.affine, first=not norms))
             channels = fan_out
         self.weights = nn.ParameterList(weights)
         self.biases = nn.ParameterList(biases)
@@ -193,9 +204,11 @@ class GroupedConv(nn.Module):
         self.num_features = channels * height * width
 
     def first(self, s: Tensor) -> Tensor:
-        """Frames as the first convolution takes them, not copied: ``[B, *frame] -> [B, C, H, W]``."""
+        """Frames as the first convolution takes them, not copied but for stacks: ``[B, *frame] -> [B, C, H, W]``."""
         if len(self.frame_shape) == 2:
             return s[:, None]
+        if len(self.frame_shape) == 4:
+            return (s.permute(0, 1, 4, 2, 3) if self.channels_last else s).reshape(s.shape[0], *self.in_shape)
         return s.permute(0, 3, 1, 2) if self.channels_last else s
 
     def forward(self, s: Tensor) -> Tensor:
@@ -332,7 +345,7 @@ def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
 
     Args:
         shape: of one observation.
-        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes.
+        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes, or four.
 
     Example:
         >>> body_for((84, 84, 4), True).kernel_sizes, body_for((10, 10), True).kernel_sizes
@@ -340,7 +353,7 @@ def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
         >>> body_for((4,), False).hidden
         (128, 128)
     """
-    if len(shape) == 3 or (len(shape) == 2 and is_frame):
+    if len(shape) in (3, 4) or (len(shape) == 2 and is_frame):
         sides = channels_first(shape)[1:]
         if min(sides) >= 3:
             return replace(NAMED_BODIES["conv" if min(sides) >= 36 else "minatar"], channel_order="auto")  # type: ignore[arg-type]

@@ -19,6 +19,8 @@ from neuralq.types import QFunction
 
 __all__ = ["CategoricalQ", "Distributional", "QuantileQ", "atoms", "distribution_of"]
 
+_LEAST_STEP = 64  # roundings between two atoms; with fewer, what is shared between neighbours adds up to another mass
+
 
 def _actions_of(inner: QFunction, num_atoms: int) -> int:
     check_whole("num_atoms", num_atoms)
@@ -111,6 +113,12 @@ class CategoricalQ(nn.Module):
         self.num_atoms = num_atoms
         self.inner = inner
         first = next(iter(inner.parameters()))  # type: ignore[attr-defined]
+        step, size = (value_max - value_min) / (num_atoms - 1), max(abs(value_min), abs(value_max))
+        if step < _LEAST_STEP * torch.finfo(first.dtype).eps * size or size > torch.finfo(first.dtype).max / 2:
+            raise ValueError(
+                f"{num_atoms} atoms from {value_min:g} to {value_max:g} lie closer together than {first.dtype} tells "
+                "apart at their size; take fewer, a wider range, or one nearer 0"
+            )
         grid = torch.linspace(value_min, value_max, num_atoms, dtype=torch.float64)
         self.register_buffer("support", grid.to(first.dtype), persistent=False)
 

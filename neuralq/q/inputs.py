@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_whole
+from neuralq.types import Array
 
 __all__ = ["OneHot", "Pixels"]
 
@@ -35,19 +37,28 @@ class OneHot(nn.Module):
 
 
 class Pixels(nn.Module):
-    """Bytes to brightness in [0, 1]: ``x / 255``; has no parameters.
+    """Bytes to brightness in [0, 1]: ``x / 255``, or ``(x − origin) / divisor``; has no parameters.
+
+    Args:
+        divisor: a number, or one for each entry of an observation.
+        origin: likewise.
 
     Example:
         >>> Pixels()(torch.tensor([0, 255], dtype=torch.uint8)).tolist()
         [0.0, 1.0]
     """
 
+    def __init__(self, divisor: float | Array = 255.0, origin: float | Array = 0.0) -> None:
+        super().__init__()
+        for name, value in (("divisor", divisor), ("origin", origin)):
+            self.register_buffer(name, torch.as_tensor(np.asarray(value, np.float32)), persistent=False)
+
     def forward(self, image: Tensor) -> Tensor:
-        """Scaled pixels: ``[*n, *obs] uint8 -> [*n, *obs] float32``.
+        """Scaled bytes: ``[*n, *obs] uint8 -> [*n, *obs] float32``.
 
         Raises:
             ValueError: ``image`` is not uint8 (scaling it twice would go unnoticed).
         """
         if image.dtype != torch.uint8:
             raise ValueError(f"Pixels takes uint8 images, got {image.dtype}; leave Pixels out for scaled images")
-        return image.to(torch.float32) / 255
+        return (image.to(torch.float32) - self.get_buffer("origin")) / self.get_buffer("divisor")

@@ -14,6 +14,8 @@ Running means start at zero and are divided by 1 − βᵗ (bias correction). We
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -45,7 +47,7 @@ def obgd_step_size(trace_norm: Tensor, delta: Tensor, step_size: float, kappa: f
         tensor(0.1250)
     """
     bound = step_size * kappa * delta.abs().clamp_min(1.0) * trace_norm
-    return step_size / bound.clamp_min(1.0)
+    return _unless_infinite(step_size / bound.clamp_min(1.0), bound)
 
 
 def obgd(z: Tensor, delta: Tensor, step_size: float, kappa: float) -> Tensor:
@@ -100,7 +102,7 @@ def adaptive_obgd(
     """
     check_same_shape("v", v, "z", z)
     v = beta2 * v + (1.0 - beta2) * (delta * z) ** 2
-    u = z / (v / (1.0 - beta2**num_updates) + EPSILON).sqrt()
+    u = _unless_infinite(z / (v / (1.0 - beta2**num_updates) + EPSILON).sqrt(), v)
     return obgd(u, delta, step_size, kappa), v
 
 
@@ -128,7 +130,7 @@ def intentional(
         v: running mean of g² before this step, ``[d]``.
         means: σ and e before this step, ``[2]``; (0, 1) at first.
         num_updates: t ≥ 1, this update counted.
-        decay: γλ in [0, 1).
+        decay: γλ in [0, 1]; at 1 the running mean is the mean of all steps, which is its limit.
         step_size: η > 0, the fraction.
         beta2: β₂ in (0, 1).
 
@@ -153,10 +155,16 @@ def intentional(
     v = beta2 * v + (1.0 - beta2) * grad**2
     scale = (v / (1.0 - beta2**num_updates)).sqrt() + EPSILON
     fresh, spread = (grad**2 / scale).sum(-1), (z**2 / scale).sum(-1)
-    sigma = decay * means[0] + (1.0 - decay) * fresh
+    rate, weight = (1.0 - decay, 1.0 - decay**num_updates) if decay < 1 else (1.0 / num_updates, 1.0)
+    sigma = (1.0 - rate) * means[0] + rate * fresh
     squares = CLIP_DECAY * means[1] + (1.0 - CLIP_DECAY) * delta**2
     limit = CLIP * (squares / (1.0 - CLIP_DECAY**num_updates)).sqrt()
     clipped = torch.minimum(torch.maximum(delta.to(limit.dtype), -limit), limit)
-    root = (sigma / (1.0 - decay**num_updates) * spread).sqrt()
-    step = (step_size / root.clamp_min(EPSILON) * clipped).to(z.dtype)
+    root = (sigma / weight * spread).sqrt()
+    step = _unless_infinite(step_size / root.clamp_min(EPSILON) * clipped, root).to(z.dtype)
     return step * z / scale, v, torch.stack([sigma, squares]).to(means.dtype)
+
+
+def _unless_infinite(step: Tensor, size: Tensor) -> Tensor:
+    """``step``, and NaN where the size that divides it has overflowed: 0 would stop learning without a word."""
+    return torch.where(torch.isinf(size), math.nan, step)

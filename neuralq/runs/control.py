@@ -17,7 +17,7 @@ from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
 from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
-from neuralq.runs.evaluation import MOST_STEPS, Evaluation, evaluate_greedy
+from neuralq.runs.evaluation import MOST_STEPS, Evaluation, evaluate_greedy, shown
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.files import read_rows
@@ -35,6 +35,8 @@ from neuralq.runs.recipe.build import (
     plan_of,
 )
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.lookahead import warnings_ahead
+from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
@@ -76,7 +78,7 @@ class Run:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        score = "not evaluated" if self.greedy_return is None else f"greedy return {self.greedy_return:.1f}"
+        score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
         return [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}"
@@ -100,7 +102,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
 
 def _load_agent(run_dir: str | Path, best: bool) -> Agent:
     config = config_from_dict(read_config(run_dir))
-    parameters, statistics = _kept(Path(run_dir), best)
+    parameters, statistics, scalings = _kept(Path(run_dir), best)
     envs = make_envs(config, 1)
     try:
         seen = normalisation_for(config, envs)
@@ -108,6 +110,7 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
             seen.load_state_dict(statistics)
             seen = seen.frozen()
         stream = Interaction(envs, config.gamma, 0, config.layout == "table", seen)
+        stream.encoder.require_scalings(scalings)
         q = build_q(config, stream.spec, np.random.default_rng(0))
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
@@ -117,11 +120,11 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
         envs.close()
 
 
-def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
-    """The flat parameters, and the statistics through which observations were seen."""
+def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
+    """The flat parameters, and the statistics and the scales through which observations were seen."""
     if best:
         kept = load_best(run_dir)
-        return kept.parameters, kept.normalisation
+        return kept.parameters, kept.normalisation, kept.scalings
     newest = checkpoint.load_newest(run_dir / "checkpoints")
     saved = newest.state
     compared(saved.get("origin"), read_config(run_dir), newest.path)
@@ -129,7 +132,7 @@ def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any]:
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
         parameters = state["average"]["values"]
-    return torch.as_tensor(parameters), saved["stream"].get("normalisation")
+    return torch.as_tensor(parameters), saved["stream"].get("normalisation"), saved["stream"].get("scalings")
 
 
 def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool = False) -> Evaluation:
@@ -163,17 +166,22 @@ def _last_cap(run_dir: str | Path) -> int:
     return max(1, next(caps, MOST_STEPS))
 
 
+def _opening(config: RunConfig, session: Session) -> list[str]:
+    warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
+    return [*opening_lines(session.stream), *warned]
+
+
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     exploration = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
     notes = [f"ε {exploration.value(latest['env_steps']):.3g}"]
-    for name, shown in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
+    for name, label in (("abs_td_error", "|δ|"), ("max_q", "max Q")):
         if name in latest:
-            notes.append(f"{shown} {latest[name]:.3g}")
+            notes.append(f"{label} {latest[name]:.3g}")
     if "episode_return" in latest:
-        notes.append(f"return {latest['episode_return']:.1f}")
+        notes.append(f"return {shown(latest['episode_return'])}")
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
-        notes.append(f"greedy {latest['greedy_return']:.1f}{goal}")
+        notes.append(f"greedy {shown(latest['greedy_return'])}{goal}")
     if latest.get("num_cut"):
         notes.append(f"{latest['num_cut']} of {len(latest['returns'])} evaluation episodes cut")
     return notes
@@ -202,4 +210,5 @@ CONTROL = Kind(
     load=_load_agent,
     notes=_notes,
     changeable=_CHANGEABLE,
+    opening=_opening,
 )

@@ -5,7 +5,7 @@ The first episode of every environment counts and no other: taking whichever fin
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from neuralq.runs.stop_request import raise_if_asked
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.acting import choose_greedy
 
-__all__ = ["MOST_STEPS", "Evaluation", "evaluate_greedy"]
+__all__ = ["MOST_STEPS", "Evaluation", "evaluate_greedy", "shown"]
 
 MOST_STEPS = 10_000
 """After so many an episode is cut where nothing else is said."""
@@ -55,16 +55,30 @@ class Evaluation:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        error = "" if self.standard_error is None else f" ± {self.standard_error:.2f} (standard error)"
+        places = 2 + _more_places(self.returns)
+        error = "" if self.standard_error is None else f" ± {self.standard_error:.{places}f} (standard error)"
+        spread = [f"{x:.{places - 1}f}" for x in np.percentile(self.returns, [0, 25, 50, 75, 100])]
         lines = [
-            f"mean return {self.mean:.2f}{error} over {len(self.returns)} episodes",
-            "lowest {:.1f}, quartiles {:.1f} {:.1f} {:.1f}, highest {:.1f}".format(
-                *np.percentile(self.returns, [0, 25, 50, 75, 100])
-            ),
+            f"mean return {self.mean:.{places}f}{error} over {len(self.returns)} episodes",
+            f"lowest {spread[0]}, quartiles {' '.join(spread[1:4])}, highest {spread[4]}",
         ]
         if self.num_cut:
             lines.append(f"{self.num_cut} episodes were cut off: the environment did not end them")
         return lines
+
+
+def shown(value: float, places: int = 1) -> str:
+    """A return for people: so many decimals, and two more where returns lie within ±1.
+
+    Example:
+        >>> shown(20.24), shown(0.9731)
+        ('20.2', '0.973')
+    """
+    return f"{value:.{places + _more_places([value])}f}"
+
+
+def _more_places(returns: Sequence[float]) -> int:
+    return 2 if max(map(abs, returns)) <= 1 else 0
 
 
 def evaluate_greedy(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from neuralq.checks import MissingExtra
+from neuralq.checks import MissingExtra, check_module_name
 from neuralq.runs.folder.files import write_durably
 
 __all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
@@ -44,20 +44,24 @@ class TensorBoard:
         self._writer.close()
 
 
-def own_hook(name: str) -> Callable[[Mapping[str, Any]], None]:
+def own_hook(name: str, config: Any = None) -> Callable[[Mapping[str, Any]], None]:
     """A hook of the user's own: a function that takes a row of metrics, or a class whose instances do.
 
     Args:
-        name: "package.module:name", imported as environments and bodies of one's own are.
+        name: "package.module:name", imported as environments and bodies of one's own are. A class is called without
+            arguments, or its method ``of`` with the configuration, as that of `neuralq.lab.DivergenceMonitor`.
+        config: of the run.
 
     Raises:
-        ValueError: if there is nothing of that name, or it cannot be called.
+        ValueError: if there is nothing of that name, or it cannot be made or called.
 
     Example:
         >>> own_hook("builtins:print")({"kind": "train", "env_steps": 64})
         {'kind': 'train', 'env_steps': 64}
     """
     place, _, attribute = name.partition(":")
+    if attribute:
+        check_module_name("the hook", place, name)
     try:
         found: Any = importlib.import_module(place) if attribute else None
         for part in attribute.split("."):
@@ -66,10 +70,12 @@ def own_hook(name: str) -> Callable[[Mapping[str, Any]], None]:
         raise ValueError(f"cannot import the hook {name!r}: {error}; name it as 'module:function'") from error
     except (Exception, SystemExit) as error:  # the user's own code ran
         raise ValueError(f"cannot import the hook {name!r}: it raised {type(error).__name__}: {error}") from error
-    try:
-        hook = found() if isinstance(found, type) else found
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"cannot make the hook {name!r}: it raised {type(error).__name__}: {error}") from error
+    hook = found
+    if isinstance(found, type):
+        try:
+            hook = found.of(config) if hasattr(found, "of") else found()
+        except (Exception, SystemExit) as error:
+            raise ValueError(f"cannot make the hook {name!r}: it raised {type(error).__name__}: {error}") from error
     if not callable(hook):
         raise ValueError(f"the hook {name!r} must take a row of metrics when called, got {hook!r}")
     return cast(Callable[[Mapping[str, Any]], None], hook)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import os
 import signal
@@ -23,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from neuralq.runs.folder.files import RunFolderError
 from neuralq.runs.folder.origin import ARITHMETIC
 from neuralq.runs.folder.run_folder import RunFolder, claimed, is_run_folder, read_config, refuse_old_run
-from neuralq.runs.loop import Hook, Plan, Progress, Trainee, continued, fit
+from neuralq.runs.loop import Hook, Plan, Progress, Speaks, Trainee, continued, fit, say_to
 from neuralq.runs.stop_request import StopRequest
 
 __all__ = ["KINDS", "Kind", "Result", "kind_in", "kind_named", "kind_of", "limited_threads"]
@@ -92,6 +93,8 @@ class Kind(Generic[C, T, R]):
         plan: when a run is evaluated, saved and stopped.
         result: of a run that has ended, which is told by the name it was given; may leave files there.
         load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
+        opening: what is worth saying of a run, once, before it trains; what begins with "warning: " is said to whoever
+            listens to nothing else, too.
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
         changeable: fields that do not decide what is learned: a run may go on with other values.
         command: what the command line has to know to train by options of the kind's own.
@@ -112,6 +115,7 @@ class Kind(Generic[C, T, R]):
     notes: Callable[[C, Mapping[str, Any]], list[str]]
     changeable: frozenset[str] = frozenset()
     command: CommandLine | None = None
+    opening: Callable[[C, T], list[str]] | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
@@ -192,6 +196,10 @@ class Kind(Generic[C, T, R]):
         plan = self.plan(config)
         reached = plan.stop_at_return is not None and progress.reached_at is not None
         if not (progress.finished and (reached or trainee.amount >= plan.budget)):
+            for line in [] if self.opening is None else self.opening(config, trainee):
+                say_to(hooks, line)
+            if isinstance(trainee, Speaks):
+                trainee.say = functools.partial(say_to, hooks)
             fit(trainee, plan, progress, folder, hooks)
         else:
             warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)

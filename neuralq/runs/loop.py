@@ -6,10 +6,11 @@ its `Progress`; a checkpoint holds exactly the first and the last, so a run that
 
 from __future__ import annotations
 
+import logging
 import time
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
@@ -27,12 +28,15 @@ __all__ = [
     "Diverged",
     "Hook",
     "HookFault",
+    "Listener",
     "Observer",
     "Plan",
     "Progress",
+    "Speaks",
     "Trainee",
     "continued",
     "fit",
+    "say_to",
     "seed_for",
 ]
 
@@ -62,6 +66,31 @@ class Observer(Protocol):
     def __call__(self, row: Mapping[str, Any], /) -> None:
         """Take in one row."""
         ...
+
+
+@runtime_checkable
+class Listener(Protocol):
+    """A hook that is also told, in a line each, what is worth knowing of a run before it begins."""
+
+    def say(self, line: str, /) -> None:
+        """Take in one line."""
+        ...
+
+
+@runtime_checkable
+class Speaks(Protocol):
+    """A trainee that may have something to say while it trains; it is given ``say``."""
+
+    say: Callable[[str], None]
+
+
+def say_to(hooks: Sequence[Hook], line: str) -> None:
+    """A line to every hook that listens; a warning that nobody listens to goes to the log ``neuralq``."""
+    listeners = [hook for hook in hooks if isinstance(hook, Listener)]
+    for listener in listeners:
+        listener.say(line)
+    if not listeners and line.startswith("warning: "):
+        logging.getLogger("neuralq").warning(line.removeprefix("warning: "))
 
 
 class HookFault(RuntimeError):

@@ -22,6 +22,7 @@ from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Interaction, Policy
+from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.experience import ExperienceSource, Sample
 
 __all__ = ["Session", "cap_on_evaluation"]
@@ -44,6 +45,8 @@ class Session:
         evaluation_max_steps: bound on an evaluation episode where the environment has none; None to learn one from
             the episodes of training (`cap_on_evaluation`).
         evaluate_every: environment steps between evaluations.
+        value_range: the smallest and the largest return that the learner can represent, where it cannot represent all.
+        reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
     """
 
     stream: Interaction
@@ -57,12 +60,24 @@ class Session:
     evaluation_episodes: int
     evaluation_max_steps: int | None
     evaluate_every: int
+    reward_scale: float = 1.0
+    value_range: tuple[float, float] | None = None
     _evaluation: Interaction | None = field(init=False, default=None)
     _cannot_evaluate: bool = field(init=False, default=False)
     _longest: int = field(init=False, default=0)
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
+    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    _early: EarlyReturns | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        """Watch the first returns where some of them cannot be represented."""
+        if self.value_range is not None:
+            stream = self.stream
+            self._early = EarlyReturns(
+                *self.value_range, stream.discount, stream.num_envs, lambda line: self.say(f"warning: {line}")
+            )
 
     @property
     def evaluation_stream(self) -> Interaction:
@@ -98,6 +113,8 @@ class Session:
         while True:
             step = stream.step(self.policy)
             experience.add(step)
+            if self._early is not None:
+                self._early = self._early.add(step)
             for episode in step.episodes:
                 self._recent_returns.append(episode.episode_return)
                 self._longest = max(self._longest, episode.length)
@@ -116,8 +133,15 @@ class Session:
         return {"episode_return": recent, "num_updates": self.learner.num_updates, **self._last_metrics()}
 
     def _last_metrics(self) -> dict[str, float]:
-        """Of the last update, which may have been before the run was resumed."""
-        return self._metrics_before if self._last is None else self._last[0].metrics()
+        """Of the last update, which may have been before the run was resumed, in the environment's units."""
+        if self._last is None:
+            return self._metrics_before
+        seen = self.stream.normalisation
+        scale = self.reward_scale * (1.0 if seen is None else seen.reward_scale)
+        return {
+            name: value / (scale * scale if name == "loss" else scale)
+            for name, value in self._last[0].metrics().items()
+        }
 
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""
@@ -140,7 +164,8 @@ class Session:
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
-        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics)
+        scalings = self.stream.encoder.scalings
+        return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
 
     def _cap(self) -> int:
         if self.evaluation_max_steps is not None:
@@ -168,10 +193,11 @@ class Session:
             Diverged: if they are not.
         """
         if not bool(torch.isfinite(self.learner.engine.flat.values).all()):
+            longest = getattr(getattr(self.learner, "settings", None), "lambda_", 0.0) == 1
             raise Diverged(
                 f"after {self.env_steps:,} environment steps the parameters are no longer finite: training "
-                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, a target network "
-                "or λ nearer 1"
+                "diverged; nothing was saved over the last checkpoint. Try a smaller step size, "
+                + ("smaller rewards or a target network" if longest else "a target network or λ nearer 1")
             )
 
     def state_dict(self) -> dict[str, Any]:

@@ -107,7 +107,8 @@ def batch_td(
         experience: the batch.
         lambda_: λ in [0, 1]: 0 gives certainty equivalence, 1 the least squares fit.
         step_size: α, small against 1 / (visits of a state in the batch).
-        tol: largest change of a value, divided by the step size, that counts as none.
+        tol: largest change of a value, divided by the step size, that counts as none; times the largest |reward| or
+            |value| where that is below 1. What is rounding counts as none too.
         max_presentations: give up after so many.
 
     Raises:
@@ -127,16 +128,18 @@ def batch_td(
     check_positive("step_size", step_size)
     check_positive("tol", tol)
     check_whole("max_presentations", max_presentations)
-    table, batch = table_from(_column(v)), _one_action(experience)
+    table, batch, eps = table_from(_column(v)), _one_action(experience), float(np.finfo(np.float64).eps)
     pending = np.zeros(len(table.q))
     learner = _learner(table, step_code(step_size, 1), lambda_, "accumulating", "batch", pending)
     replay(learner, batch)  # checks the batch; its increments are those of the first presentation
+    largest = float(np.max(np.abs(batch.r_t), initial=0.0))
     walk, nothing, log = new_walk(0), empty_arrays(), log_of(batch)
     for _ in range(max_presentations):
         table.q[:, 0] += pending
         moved = float(np.max(np.abs(pending)))
         pending[:] = 0
-        if moved <= tol * step_size:
+        size = max(largest, float(np.max(np.abs(table.q), initial=0.0)))
+        if moved <= max(tol * min(1.0, size), len(batch) * eps * size) * step_size:
             return table.q[:, 0].copy(), True
         learner.run(nothing, walk, log, 0.0, len(batch))
     return table.q[:, 0].copy(), False

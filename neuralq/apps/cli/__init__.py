@@ -10,9 +10,11 @@ import importlib
 import itertools
 import json
 import os
+import re
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,6 +22,7 @@ from typing import Any, NamedTuple, TextIO
 
 __all__ = [
     "COMMANDS",
+    "DEBUG",
     "Command",
     "CommandParser",
     "Failure",
@@ -73,7 +76,9 @@ EXAMPLES = """examples:
   neuralq resume runs/CartPole-v1-action-output-s0-20260101-120000
   neuralq solve FrozenLake-v1 --gamma 0.95
 
-`neuralq COMMAND --help` tells a command's options. Every command takes --json."""
+`neuralq COMMAND --help` tells a command's options. Every command takes --json and --debug."""
+
+DEBUG = "show the whole traceback of what goes wrong"
 
 
 class Failure(Exception):
@@ -100,8 +105,9 @@ _output: contextvars.ContextVar[TextIO | None] = contextvars.ContextVar("_output
 def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: Any = None
 ) -> None:
-    """A warning for whoever typed the command: what it says, not where in the code."""
-    print(f"neuralq: warning: {message}", file=sys.stderr)
+    """A warning for whoever typed the command: what it says, not where in the code, nor in which colour."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(message)).removeprefix("WARN: ")  # as Gymnasium writes its own
+    print(f"neuralq: warning: {text}", file=sys.stderr)
 
 
 class _Asked(Exception):
@@ -156,6 +162,7 @@ def command_parser(name: str, description: str, *examples: str) -> CommandParser
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object on the last line")
+    parser.add_argument("--debug", action="store_true", help=DEBUG)
     return parser
 
 
@@ -247,6 +254,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
     if not arguments:
         print(_top_help(), file=sys.stderr)
         return 2
@@ -267,10 +276,13 @@ def _main(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         print("neuralq: interrupted", file=sys.stderr)
         return 130
-    except (ValueError, RuntimeError, OSError, ImportError, MemoryError) as error:
-        from neuralq.apps.cli.faults import USER_FAULTS
+    except Exception as error:
+        from neuralq.apps.cli.faults import explained
 
-        if not isinstance(error, USER_FAULTS):
+        lines = explained(error)
+        if lines is None:
             raise
-        print(f"neuralq: error: {error}", file=sys.stderr)
+        if debug:
+            traceback.print_exception(error)
+        print(f"neuralq: error: {lines[0]}", *lines[1:], sep="\n", file=sys.stderr)
         return 1

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.sweeps import refuse_other_kinds
+from neuralq.runs.evaluation import shown
 from neuralq.runs.report.comparison import Group, comparison_png, comparison_svg, read_groups
 from neuralq.runs.report.page import format_value
 
@@ -88,9 +89,9 @@ def _numbers(group: Group) -> list[str]:
     return [
         group.name,
         str(len(group.runs)),
-        f"{found.iqm:.1f}",
-        "–" if found.low is None or found.high is None else f"{found.low:.1f} … {found.high:.1f}",
-        f"{sum(group.returns) / len(group.runs):.1f}",
+        shown(found.iqm),
+        "–" if found.low is None or found.high is None else f"{shown(found.low)} … {shown(found.high)}",
+        shown(sum(group.returns) / len(group.runs)),
         _spread([run.env_steps for run in group.runs]),
         _spread([run.cpu_seconds for run in group.runs]),
     ]
@@ -109,5 +110,5 @@ def _in_words(group: Group) -> str:
 def _spread(values: Sequence[float]) -> str:
     """One number, or the smallest and the largest."""
     low, high = min(values), max(values)
-    shown = [f"{value:,}" if isinstance(value, int) else f"{value:.1f}" for value in (low, high)]
-    return shown[0] if shown[0] == shown[1] else "–".join(shown)
+    words = [f"{value:,}" if isinstance(value, int) else f"{value:.1f}" for value in (low, high)]
+    return words[0] if words[0] == words[1] else "–".join(words)

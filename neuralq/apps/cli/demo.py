@@ -18,6 +18,7 @@ from neuralq.apps.pages.star import divergence_svg, write_demo_report
 from neuralq.lab import Problem, RepresentationResult, predict_representations, run_representations
 from neuralq.runs import Run, RunConfig, preset_for, train
 from neuralq.runs.control import CONTROL
+from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.run_folder import is_run_folder, read_metrics
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq_envs.counterexamples import star
@@ -71,7 +72,7 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
     with training_bar(CONTROL, config) as bar:
         run = train(config, path, [bar])
     console.print(
-        f"   greedy return {run.greedy_return:.1f} over 20 episodes after {run.env_steps:,} steps: "
+        f"   greedy return {shown(run.greedy_return or 0.0)} over 20 episodes after {run.env_steps:,} steps: "
         f"{run.cpu_seconds:.2f} CPU-seconds of training, {run.wall_seconds:.1f} s with evaluation",
         highlight=False,
         soft_wrap=True,

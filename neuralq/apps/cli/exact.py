@@ -33,7 +33,7 @@ _FROZEN_LAKE, _CLIFF_WALKING = (3, 2, 1, 0), (0, 1, 2, 3)
 def solve(argv: list[str]) -> int:
     """Solve the model of an environment and print values, policy and the guaranteed bound."""
     options = _parser().parse_args(argv)
-    mdp, layout = _model(options.env, options.env_kwargs)
+    mdp, layout, limit = _model(options.env, options.env_kwargs, check=not options.no_check)
     solution = solve_mdp(mdp, options.gamma, options.method, options.tol, max_iterations=options.max_iterations)
     grid, lines = None, _table(mdp, solution)
     if layout is not None:
@@ -44,12 +44,14 @@ def solve(argv: list[str]) -> int:
             raise Failure(f"{options.env} names no rows and columns, so there is no grid to draw; leave out --svg")
         page = ChapterPage("solve", f"{options.env}, γ = {options.gamma:g}", "", (), (), (grid,))
         Path(options.svg).write_text(page_svg(page), encoding="utf-8")
-    actions = [np.flatnonzero(row).tolist() for row in solution.optimal_actions]
+    known = solution.separated
+    actions = [np.flatnonzero(row).tolist() if known[s] else None for s, row in enumerate(solution.optimal_actions)]
     plain = {
         "env": options.env,
         "gamma": options.gamma,
         "method": solution.method,
         "num_states": mdp.num_states,
+        "max_episode_steps": limit,
         "v": solution.v.tolist(),
         "policy": solution.policy.tolist(),
         "optimal_actions": actions,
@@ -60,7 +62,8 @@ def solve(argv: list[str]) -> int:
         "converged": solution.converged,
         "seconds": solution.seconds,
     }
-    print_result(plain, options.json, [*lines, *_summary(solution)])
+    cut = [] if limit is None else [f"episodes are cut after {limit:,} steps; these are the values without the cut"]
+    print_result(plain, options.json, [*lines, *_summary(solution), *cut])
     if not solution.converged:
         raise Failure(f"did not converge: the error may be as large as {solution.bound:.3g}; allow a larger --tol")
     return 0
@@ -79,12 +82,22 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--gamma", type=float, default=0.99, help="discount (default: 0.99)")
     parser.add_argument("--method", default="auto", choices=METHODS, help="how to solve it (default: auto)")
-    parser.add_argument("--tol", type=float, default=1e-8, help="guaranteed largest error of V (default: 1e-8)")
+    parser.add_argument(
+        "--tol",
+        type=float,
+        help="guaranteed largest error of V, times the largest |V| where rounding allows no less (default: 1e-8, or a "
+        "millionth of the largest |reward| where that is less)",
+    )
     parser.add_argument(
         "--max-iterations", type=int, metavar="N", help="stop after so many (default: when it is solved)"
     )
     parser.add_argument(
         "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
+    )
+    parser.add_argument(
+        "--no-check",
+        action="store_true",
+        help="take the table as it stands; else a few thousand steps of the environment are compared with it first",
     )
     parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
     return parser
@@ -105,12 +118,12 @@ def _json_object(text: str) -> dict[str, Any]:
     return value
 
 
-def _model(env_id: str, kwargs: dict[str, Any]) -> tuple[FiniteMDP, _Layout | None]:
+def _model(env_id: str, kwargs: dict[str, Any], *, check: bool) -> tuple[FiniteMDP, _Layout | None, int | None]:
     with refusals_name(env_id):
         env = make_single(env_id, kwargs)
     try:
-        mdp = FiniteMDP.from_gymnasium(env)
-        return mdp, _layout(env.unwrapped, mdp)
+        mdp = FiniteMDP.from_gymnasium(env, check=check)
+        return mdp, _layout(env.unwrapped, mdp), None if env.spec is None else env.spec.max_episode_steps
     finally:
         env.close()
 
@@ -132,7 +145,8 @@ class _Layout(NamedTuple):
             elif mdp.is_terminal[s]:
                 cells.append(Square("end") if entered[s] else Square(wall=True))
             else:
-                best = sorted(self.directions[a] for a in np.flatnonzero(solution.optimal_actions[s]))
+                known = np.flatnonzero(solution.optimal_actions[s]) if solution.separated[s] else ()
+                best = sorted(self.directions[a] for a in known)
                 arrows = tuple(map(Arrow, best))
                 cells.append(Square(short(float(solution.v[s])), arrows))
         return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
@@ -175,13 +189,14 @@ def _legend(layout: _Layout) -> str:
 
 
 def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
-    names = mdp.state_names or [""] * mdp.num_states
+    names, known = mdp.state_names or [""] * mdp.num_states, solution.separated
     lines = ["state        V*  optimal actions"]
     for s in range(min(len(solution.v), _MOST_ROWS)):
         chosen = np.flatnonzero(solution.optimal_actions[s])
         actions = (
             " ".join(str(a) if mdp.action_names is None else mdp.action_names[int(a)] for a in chosen) or "terminal"
         )
+        actions = actions if known[s] else "not known"
         lines.append(f"{s:5d}  {solution.v[s]:8.4f}  {actions}{f'  ({names[s]})' if names[s] else ''}")
     if len(solution.v) > _MOST_ROWS:
         lines.append(f"… and {len(solution.v) - _MOST_ROWS} more states (--json has them all)")
@@ -189,8 +204,11 @@ def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
 
 
 def _summary(solution: Solution) -> list[str]:
-    count = count_optimal_policies(solution)
-    policies = f"{count:,}" if count < 1e9 else f"about 10^{len(str(count)) - 1}"
+    if solution.separated.all():
+        count = count_optimal_policies(solution)
+        policies = f"{count:,}" if count < 1e9 else f"about 10^{len(str(count)) - 1}"
+    else:
+        policies = f"not known: the bound separates no actions in {np.count_nonzero(~solution.separated):,} states"
     return [
         f"deterministic optimal policies: {policies}",
         f"{solution.method}: {solution.iterations} iterations, {solution.seconds:.3f} s, "

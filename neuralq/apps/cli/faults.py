@@ -1,23 +1,87 @@
-"""The errors that are answers to what was asked; a command prints their message and no traceback."""
+"""The errors that are answers to what was asked; a command prints their message and no traceback.
+
+Environments, bodies and hooks are somebody's own code: where that raised, its file and line are named too.
+"""
 
 from __future__ import annotations
 
+import site
+import sys
+import sysconfig
+import traceback
+from pathlib import Path
+from types import TracebackType
+
+import gymnasium as gym
+
+import neuralq
+import neuralq_envs
 from neuralq.checks import MissingExtra
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import RunFolderError
 from neuralq.runs.loop import Diverged, HookFault
 from neuralq.runs.stream import EnvironmentFault
+from neuralq.systems.backgammon.opponents import IllegalTurn
 
-__all__ = ["USER_FAULTS"]
+__all__ = ["USER_FAULTS", "explained", "own_frame"]
 
 USER_FAULTS = (
     CheckpointError,
     Diverged,
     EnvironmentFault,
     HookFault,
+    IllegalTurn,
     MemoryError,
     MissingExtra,
     OSError,
     RunFolderError,
     ValueError,
+    gym.error.Error,
 )
+
+_INSTALLED = tuple(
+    f"{Path(str(place)).resolve()}/"
+    for place in (
+        *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+        *site.getsitepackages(), site.getusersitepackages(),
+        Path(neuralq.__file__).parent, Path(neuralq_envs.__file__).parent,
+    )
+)  # fmt: skip
+
+
+def explained(error: BaseException) -> list[str] | None:
+    """What to print of an error: its message, and where in somebody's own code it arose; None if it is a fault of ours.
+
+    Example:
+        >>> explained(ValueError("gamma must lie in [0, 1]"))
+        ['gamma must lie in [0, 1]']
+    """
+    own = own_frame(error)
+    if own is None or own.filename in str(error):
+        return [str(error) or type(error).__name__] if isinstance(error, USER_FAULTS) else None
+    told = str(error) if isinstance(error, USER_FAULTS) else f"{type(error).__name__}: {error}"
+    line = f"    {own.line}" if own.line else ""
+    return [told, f"  in {own.filename}, line {own.lineno}, {own.name}{line} (--debug shows the whole traceback)"]
+
+
+def own_frame(error: BaseException) -> traceback.FrameSummary | None:
+    """The innermost frame of an error, or of what caused it, that belongs to no installed package; None without one."""
+    seen: set[int] = set()
+    found: traceback.FrameSummary | None = None
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in seen:
+        seen.add(id(cause))
+        found = _innermost_own(cause.__traceback__) or found
+        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
+    return found
+
+
+def _innermost_own(trace: TracebackType | None) -> traceback.FrameSummary | None:
+    frames = traceback.extract_tb(trace)
+    return next((frame for frame in reversed(frames) if _is_own(frame.filename)), None)
+
+
+def _is_own(filename: str) -> bool:
+    if filename.startswith("<") or Path(filename).name == Path(sys.argv[0]).name:  # the script that starts commands
+        return False
+    return not str(Path(filename).resolve()).startswith(_INSTALLED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import secrets
@@ -20,12 +21,12 @@ from neuralq.runs.agent import Agent
 from neuralq.runs.folder.files import replacing
 from neuralq.runs.loop import seed_for
 from neuralq.runs.recipe.games import make_single, refusals_name
-from neuralq.runs.stream import legal_actions
+from neuralq.runs.stream import faults_of, legal_actions
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["GifWriter", "Moment", "Mp4Writer", "caption", "frame_rate", "make_shown", "picture", "play"]
+__all__ = ["GifWriter", "Moment", "Mp4Writer", "caption", "drawn", "frame_rate", "make_shown", "picture", "play"]
 
 _INSTALL = 'install it with: pip install "neuralq[video]"'
 _MOST_GIF_FRAMES_PER_SECOND = 25  # browsers slow down what claims to be faster than 50, and every frame costs bytes
@@ -70,23 +71,45 @@ def play(env: gym.Env[Any, Any], agent: Agent, num_episodes: int, seed: int, max
 
     Raises:
         MissingExtra: if what the environment draws with turns out missing at its first picture.
+        EnvironmentFault: if its own code fails.
     """
     for episode in range(1, num_episodes + 1):
-        try:
+        with _drawing("at reset"):
             observation, info = env.reset(seed=seed_for(seed, 10, episode))
-        except gym.error.DependencyNotInstalled as error:
-            raise MissingExtra(f"the environment cannot be drawn ({error}); {_INSTALL}") from error
         total, over = 0.0, False
         for step in range(max_steps + 1):
-            mask = None if over else legal_actions(env, info)
+            with _drawing("asked for its legal actions"):
+                mask = None if over else legal_actions(env, info)
             value = math.nan if over else float(np.max(agent.values(observation, mask)))
             over = over or step == max_steps
             yield Moment(episode, step, total, value, over)
             if over:
                 break
-            observation, reward, terminated, truncated, info = env.step(agent.predict(observation, mask))
-            total += float(reward)
+            action = agent.predict(observation, mask)
+            with _drawing(f"in step {step + 1} of episode {episode}"):
+                observation, reward, terminated, truncated, info = env.step(action)
+                total += float(reward)
             over = terminated or truncated
+
+
+def drawn(env: gym.Env[Any, Any]) -> Any:
+    """What an environment draws of itself.
+
+    Raises:
+        MissingExtra: if what it draws with is not installed.
+        EnvironmentFault: if it cannot.
+    """
+    with _drawing("drawing itself"):
+        return env.render()
+
+
+@contextlib.contextmanager
+def _drawing(doing: str) -> Iterator[None]:
+    try:
+        with faults_of(doing):
+            yield
+    except gym.error.DependencyNotInstalled as error:
+        raise MissingExtra(f"the environment cannot be drawn ({error}); {_INSTALL}") from error
 
 
 def frame_rate(env: gym.Env[Any, Any]) -> float:

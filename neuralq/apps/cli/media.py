@@ -13,14 +13,14 @@ from typing import Any
 import gymnasium as gym
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.film import caption, frame_rate, make_shown, picture, play, writers_for
+from neuralq.apps.cli.film import caption, drawn, frame_rate, make_shown, picture, play, writers_for
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.apps.cli.sweeps import add_trust, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.recipe.config import config_from_dict
-from neuralq.runs.recipe.games import make_single
+from neuralq.runs.recipe.games import make_single, refusals_name
 
 __all__ = ["record", "watch"]
 
@@ -45,7 +45,7 @@ def watch(argv: list[str]) -> int:
     try:
         for moment in play(env, agent, options.episodes, options.seed, _limit(options, config)):
             if mode == "ansi":
-                print(f"{env.render()}\n{caption(moment)}\n", file=sys.stderr)
+                print(f"{drawn(env)}\n{caption(moment)}\n", file=sys.stderr)
                 time.sleep(pause)
             if moment.over:
                 returns.append(moment.episode_return)
@@ -116,7 +116,10 @@ def _limit(options: argparse.Namespace, config: RunConfig) -> int:
 
 def _modes(config: RunConfig) -> Sequence[str]:
     """What the environment can draw itself as."""
-    env = make_single(config.env, {**config.env_kwargs, "render_mode": None})
+    # Not as None: an environment that draws nothing need not know the word.
+    kwargs = {name: value for name, value in config.env_kwargs.items() if name != "render_mode"}
+    with refusals_name(config.env):
+        env = make_single(config.env, kwargs)
     try:
         return list(env.metadata.get("render_modes") or [])
     finally:
@@ -138,7 +141,11 @@ def _shown_mode(config: RunConfig, path: Path) -> str:
         return "ansi"
     if "human" in modes:
         raise Failure(f"there is no display to open a window on; film it instead: neuralq record {path} --gif run.gif")
-    way_out = f"film it: neuralq record {path} --gif run.gif" if "rgb_array" in modes else "it draws nothing"
+    way_out = (
+        f"film it: neuralq record {path} --gif run.gif"
+        if "rgb_array" in modes
+        else f"neuralq evaluate {path} plays without"
+    )
     raise Failure(f"{config.env} opens no window (it draws itself as: {', '.join(modes) or 'nothing'}); {way_out}")
 
 
@@ -155,7 +162,7 @@ def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Name
     try:
         with ProgressBar[tuple[int, str]](options.episodes, lambda report: Told(report[0], report[1:])) as bar:
             for moment in game:
-                image = picture(env.render(), caption(moment), options.width)
+                image = picture(drawn(env), caption(moment), options.width)
                 for _ in range(max(1, round(rate)) if moment.over else 1):  # the end stays for a second
                     for writer in writers:
                         writer.add(image)

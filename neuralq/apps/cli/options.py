@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import inspect
 import itertools
 import json
 import re
@@ -16,7 +17,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
-from neuralq.apps.cli import Failure
+from neuralq.apps.cli import DEBUG, Failure
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
@@ -51,7 +52,7 @@ _EXAMPLES = """examples:
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
-_WITHOUT_VALUE = {"h", "help", "json", "tensorboard", "wandb", "print_config"}
+_WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "print_config"}
 
 
 @dataclass(frozen=True)
@@ -234,8 +235,10 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
 
 def _field_help(settings: type) -> dict[str, str]:
     """What each field of a dataclass is for, read from its docstring, so that it is written once."""
-    block = re.split(r"\n {4}\w+:", (settings.__doc__ or "").split("Args:")[1])[0]
-    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {8}(\w+): (.*?)(?=\n {8}\w+:|\Z)", block, re.DOTALL)}
+    # Python 3.13 takes the indentation away when it compiles, and `python -OO` the docstring.
+    text = inspect.cleandoc(settings.__doc__ or "")
+    block = re.split(r"\n\w+:", text.partition("Args:")[2])[0]
+    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {4}(\w+): (.*?)(?=\n {4}\w+:|\Z)", block, re.DOTALL)}
 
 
 def add_fields(
@@ -273,7 +276,7 @@ def add_fields(
         words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
         kind = next((k for k in (hint, *get_args(hint)) if k in words), str)
         shown = "" if default is MISSING else f" (default: {'none' if default is None else default})"
-        text = f"{texts[f.name].rstrip('.')}{shown}".replace("%", "%%")
+        text = f"{texts.get(f.name, f.name.replace('_', ' ')).rstrip('.')}{shown}".replace("%", "%%")
         option = f"--{prefix}{short.get(f.name, f.name)}"
         parser.add_argument(option, dest=prefix + f.name, metavar=words[kind], help=text, **more)
 
@@ -302,6 +305,7 @@ _FLAGS = {
     "tensorboard": "write TensorBoard event files (extra tensorboard)",
     "wandb": "log to Weights & Biases (extra wandb)",
     "json": "print the result as one JSON object on the last line",
+    "debug": DEBUG,
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TextIO, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 if TYPE_CHECKING:
     from neuralq.runs.kinds import Kind
@@ -18,6 +20,10 @@ __all__ = ["ProgressBar", "Told", "training_bar"]
 
 _QUIET_SECONDS = 10.0
 """Where the output is no terminal: one line at most this often."""
+_NOTEBOOK_SECONDS = 2.0
+"""In a notebook, where somebody looks; the first line is due at once."""
+_WIDE = 100
+"""Characters of a terminal from which the bar is drawn at its full width."""
 
 T = TypeVar("T")
 
@@ -64,16 +70,21 @@ class ProgressBar(Generic[T]):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._tell, self._clock = tell, clock
-        self._console = Console(file=stream or sys.stderr)
-        self._said = (clock(), 0)
+        # Not as a notebook: that would draw nothing where there is no terminal, as here.
+        self._console = Console(file=stream or sys.stderr, force_jupyter=False)
+        in_notebook = "ipykernel" in sys.modules
+        self._quiet = _NOTEBOOK_SECONDS if in_notebook else _QUIET_SECONDS
+        self._said = (-math.inf if in_notebook else clock(), 0)
         self._bar = Progress(
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=24 if self._console.width >= _WIDE else 8),
             MofNCompleteColumn(),
             TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[text]}"),
+            # What does not fit is left out here, not the columns before it.
+            TextColumn("{task.fields[text]}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
             console=self._console,
             refresh_per_second=4,
             disable=not self._console.is_terminal,
+            expand=True,
         )
         self._task = self._bar.add_task("", total=total, text="")
 
@@ -84,11 +95,17 @@ class ProgressBar(Generic[T]):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._bar.stop()
 
+    def say(self, line: str, /) -> None:
+        """A line above the bar."""
+        self._console.print(f"neuralq: {line}", highlight=False, soft_wrap=True, markup=False)
+
     def __call__(self, report: T, /) -> None:
         """Take in a report."""
         told, now = self._tell(report), self._clock()
-        self._bar.update(self._task, completed=told.so_far, text=" · ".join(told.parts))
-        if not self._console.is_terminal and (now - self._said[0] > _QUIET_SECONDS or told.event != self._said[1]):
+        narrow = self._console.width < _WIDE  # what is said last matters most, and is not to be what is left out
+        parts = reversed(told.parts) if narrow else told.parts
+        self._bar.update(self._task, completed=told.so_far, text=" · ".join(parts))
+        if not self._console.is_terminal and (now - self._said[0] > self._quiet or told.event != self._said[1]):
             self._said = (now, told.event)
             line = " · ".join(filter(None, (told.amount, *told.parts)))
             self._console.print(line, highlight=False, soft_wrap=True)

@@ -16,7 +16,7 @@ from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
 from neuralq.runs.control import CONTROL
-from neuralq.runs.evaluation import MOST_STEPS
+from neuralq.runs.evaluation import MOST_STEPS, shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
@@ -109,7 +109,7 @@ def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: s
     if wandb:
         wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
     if own is not None:
-        wanted.append(lambda: own_hook(own))
+        wanted.append(lambda: own_hook(own, config))
     with contextlib.ExitStack() as stack:
         hooks = []
         for make in wanted:
@@ -174,7 +174,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
     best = _best_return(run)
     notes = []
     if best is not None and run.greedy_return is not None and best > run.greedy_return:
-        notes.append(f"the best evaluation scored {best:.1f}: neuralq evaluate {run.run_dir} --best")
+        notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     if (cut := _cut(run)) is not None:
         notes.append(cut)
     status = conclude(run, as_json, notes, best_return=best, report=report_path)

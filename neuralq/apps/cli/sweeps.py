@@ -18,6 +18,7 @@ from neuralq.apps.cli.options import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
 from neuralq.runs.children import python_command
+from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
@@ -55,7 +56,7 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     assert options.seeds is not None
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
     if options.hook is not None:
-        own_hook(options.hook)  # a name that is wrong is one error, not one for each seed
+        own_hook(options.hook, config)  # a name that is wrong is one error, not one for each seed
         flags += ["--hook", options.hook]
     seeds = range(config.seed, config.seed + options.seeds)
     with claimed(options.run_dir, lambda: _default_path(config)) as path:
@@ -183,16 +184,16 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
     for run in result.runs:
         if run.state == "finished":
             value, seconds = run.summary.get("greedy_return"), run.summary.get("cpu_seconds") or 0.0
-            score = "not evaluated" if value is None else f"greedy return {value:.1f}"
+            score = "not evaluated" if value is None else f"greedy return {shown(value)}"
             lines.append(f"seed {run.seed}: {score}, {run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds")
         else:
             log = f" (see {sweep.log_path(run.seed)})" if run.reason else ""
             lines.append(f"seed {run.seed}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
     found = result.estimate
     if found is not None:
-        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {found.iqm:.2f}"
+        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {shown(found.iqm, 2)}"
         if found.low is not None and found.high is not None:
-            text += f", 95 % interval {found.low:.2f} to {found.high:.2f} (stratified bootstrap)"
+            text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
         lines.append(text)
     return [*lines, f"sweep folder {sweep.path}"]
 
@@ -223,7 +224,7 @@ def sweep_bar(
         if seconds > 0:
             parts.append(f"{steps / seconds:,.0f} steps/s")
         if status.returns:
-            parts.append(f"IQM {float(interquartile_mean(status.returns)):.1f}")
+            parts.append(f"IQM {shown(float(interquartile_mean(status.returns)))}")
         return Told(status.env_steps, parts, event=status.num_finished + len(status.failed))
 
     return ProgressBar(sweep.total_steps * len(sweep.seeds), tell, stream, clock)

@@ -126,6 +126,8 @@ def serve_app(
     import uvicorn
     from threadpoolctl import threadpool_limits
 
+    from neuralq.apps.web.patience import PatientProtocol
+
     if not _is_loopback(host):
         warnings.warn(
             f"{title[0].lower()}{title[1:]} is served on {host}, so whoever reaches this machine there can use it: "
@@ -145,7 +147,9 @@ def serve_app(
             announce(url)
         if open_browser:  # a moment later, when it answers
             threading.Timer(0.5, webbrowser.open, [url]).start()
-        config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
+        config = uvicorn.Config(
+            app, http=PatientProtocol, log_level="warning", access_log=False, server_header=False
+        )  # fmt: skip
         with threadpool_limits(limits=1):  # small matrices: more threads only wait for each other
             with contextlib.suppress(KeyboardInterrupt):  # that is how one ends it
                 uvicorn.Server(config).run(sockets=[listener])

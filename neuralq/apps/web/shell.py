@@ -1,8 +1,9 @@
 """What every page of this package stands behind: the host check, the headers, and the reading of what was sent.
 
 A page of another site may know this machine's address, so a request must name this machine itself in its Host header,
-and a question must be JSON by its own account, which a foreign page may not send without being asked first. JSON knows
-no NaN and no infinity, though Python's reader does, and reads 1e999 as infinite; both are refused.
+and if it says which page it comes from, that must be ours. A question must be JSON by its own account, which a foreign
+page may not send without being asked first. JSON knows no NaN and no infinity, though Python's reader does, and reads
+1e999 as infinite; both are refused, and so is text that no UTF-8 can hold, for it could not be said back.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ def read_json(body: bytes) -> Mapping[str, Any]:
     """The object that the body holds.
 
     Raises:
-        Malformed: no UTF-8, no JSON, NaN or infinity, too deeply nested, a name given twice, or not an object.
+        Malformed: no UTF-8, half a surrogate pair, no JSON, NaN or infinity, too deeply nested, a name given twice, or
+            not an object.
 
     Example:
         >>> read_json(b'{"gamma": NaN}')
@@ -73,8 +75,11 @@ def read_json(body: bytes) -> Mapping[str, Any]:
 
     try:
         given = json.loads(body.decode("utf-8"), parse_constant=refuse, object_pairs_hook=once)
+        json.dumps(given, ensure_ascii=False).encode("utf-8")
     except (ValueError, RecursionError) as error:  # a number of thousands of digits is a ValueError too
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
+        if isinstance(error, UnicodeEncodeError):
+            reason = f"half a surrogate pair ({error.object[error.start]!r}) is no character"
         raise Malformed(f"the body must be a JSON object: {reason}") from None
     if not isinstance(given, dict):
         raise Malformed(f"the body must be a JSON object, got {type(given).__name__}")
@@ -147,7 +152,7 @@ def site(
 
 
 class Guard:
-    """Answers only to its own names, and adds the headers.
+    """Answers only to its own names and its own pages, and adds the headers.
 
     Args:
         app: what it stands before.
@@ -174,11 +179,15 @@ class Guard:
             await send(message)
 
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name == b"host"]
-        if len(hosts) == 1 and self._is_own(hosts[0]):
-            await self._app(scope, receive, with_headers)
-        else:
+        origins = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"origin"]
+        if len(hosts) != 1 or not self._is_own(hosts[0]):
             refusal = PlainTextResponse("This server does not answer to that host name.\n", 400)
             await refusal(scope, receive, with_headers)
+        elif not {f"{scheme}://{hosts[0].lower()}" for scheme in ("http", "https")}.issuperset(origins):
+            refusal = PlainTextResponse("This server does not answer to pages of other sites.\n", 403)
+            await refusal(scope, receive, with_headers)
+        else:
+            await self._app(scope, receive, with_headers)
 
     def _is_own(self, host: str) -> bool:
         name, colon, port = host.rpartition(":") if not host.endswith("]") else (host, "", "")

@@ -196,8 +196,10 @@ class DivergenceMonitor:
             self._measure(row)
 
     def _measure(self, row: Mapping[str, Any]) -> None:
-        value = self._value_now if self._value_now is not None else _absolute(row.get("max_q"))
-        measured = {"abs_td_error": _absolute(row.get("abs_td_error")), "largest_value": value}
+        scale = self.traits.reward_scale  # rows are in the environment's units, the rest here in the learner's
+        told = {name: _absolute(row.get(name)) for name in ("abs_td_error", "max_q")}
+        error, value = (None if x is None else scale * x for x in told.values())
+        measured = {"abs_td_error": error, "largest_value": value if self._value_now is None else self._value_now}
         known = {name: x for name, x in measured.items() if x is not None}
         for name, x in known.items():
             if not math.isfinite(x):

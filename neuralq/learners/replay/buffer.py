@@ -132,6 +132,11 @@ class ReplayBuffer:
         return self.num_envs * self._per_env
 
     @property
+    def least_steps(self) -> int:
+        """Steps of one environment that are held for certain once it is full: short episodes take more rows."""
+        return int(min(self._per_env, self._rows.shape[1] // 2))
+
+    @property
     def num_bytes(self) -> int:
         """Bytes of the stored arrays, in memory or in the scratch file."""
         return self._rows.nbytes + self._records.nbytes + (self._tree.nodes.nbytes if self._tree else 0)
@@ -183,8 +188,10 @@ class ReplayBuffer:
         """Copies one step of one environment, given as a Gymnasium environment gives it: arrays and Python numbers.
 
         Raises:
-            ValueError: a wrong environment, or an observation of a wrong shape or dtype; nothing is stored then.
+            ValueError: a wrong environment, an observation of a wrong shape or dtype, or a reward that float32 cannot
+                hold; nothing is stored then.
         """
+        _require_storable(r_t)
         dtype = self.observation_dtype
         try:  # the quick way first: the checks cost more than the storing
             if (
@@ -217,6 +224,8 @@ class ReplayBuffer:
     def _store(self, env_indices: Indices, values: list[Array]) -> None:
         """Each field as one row without gaps, observations as bytes, reals as float32."""
         s_tm1, a_tm1, *reals, s_t, last_t = (x.ravel() for x in values)
+        largest = float(np.abs(reals[1]).max(initial=0.0))
+        _require_storable(largest)
         mu_tm1, r_t, discount_t = (x if x.dtype is _FLOAT32 else x.astype(_FLOAT32) for x in reals)
         s_tm1, s_t = s_tm1.view(np.uint8), s_t.view(np.uint8)
         store(self._records, self._rows, self._cursors, env_indices, s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t)
@@ -398,4 +407,13 @@ _FIELDS = tuple(f.name for f in fields(Transition))
 _fields = operator.attrgetter(*_FIELDS)
 _OBSERVED = (0, 5)
 _FLOAT32 = np.dtype(np.float32)
+_LARGEST_REAL = float(np.finfo(np.float32).max)
 _REAL = (_FLOAT32, np.dtype(np.float64))
+
+
+def _require_storable(r_t: float) -> None:
+    if not abs(r_t) <= _LARGEST_REAL:
+        raise ValueError(
+            f"a reward of {float(r_t):g} cannot be kept: rewards are stored in float32, up to {_LARGEST_REAL:.2g}; "
+            "scale it where the environment gives it"
+        )

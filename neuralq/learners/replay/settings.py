@@ -7,6 +7,7 @@ the stored settings say what was done.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -32,12 +33,13 @@ def _listed(records: Iterable[Distribution] | Iterable[TargetRule]) -> str:
 
 def _with_options(cls: type[_Class]) -> type[_Class]:
     """A field for every option of a target rule that has none yet; what can be chosen goes into the text."""
-    text, rules, all_distributions = cls.__doc__ or "", target_rules().values(), distributions().values()
+    text = inspect.cleandoc(cls.__doc__ or "")  # indented or not, as the version of Python has it
+    rules, all_distributions = target_rules().values(), distributions().values()
     for name, option in _options().items():
         if name not in cls.__annotations__:
             cls.__annotations__[name] = "float | None"
             setattr(cls, name, None)
-            text = f"{text.rstrip()}\n        {name}: {option.label}; None for {option.default}.\n    "
+            text = f"{text.rstrip()}\n    {name}: {option.label}; None for {option.default}.\n"
     text = text.replace("SAMPLES", _listed(rule for rule in rules if not rule.blocks))
     text = text.replace("BLOCKS", _listed(rule for rule in rules if rule.blocks))
     text = text.replace("DISTRIBUTIONS", _listed(all_distributions))

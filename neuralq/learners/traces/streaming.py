@@ -17,6 +17,7 @@ and `StreamingLearner` is streaming TD(λ).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,7 @@ from neuralq.types import Transition
 
 __all__ = ["STREAMING", "StreamingLearner", "StreamingSettings"]
 
+_SQUARES_CHECKED_EVERY = 64  # steps; the tensor operations look at each, the kernel leaves that to this file
 _BOUNDS = ("obgd", "adaptive-obgd", "intentional")
 
 
@@ -142,8 +144,13 @@ class _Steps:
 
     def advance_compiled(self, delta: float, t: int) -> None:
         """As `advance`, in two passes over the memory."""
+        if self.settings.bound == "intentional" and self.gamma_lambda == 1:  # a mean that the kernel does not keep
+            self.advance(torch.tensor(delta, dtype=self.z.dtype), t)
+            return
         arguments: Any = (*self._memory, float(self._decay), delta, *self._constants, t)
         kernels.advance(*arguments)
+        if t % _SQUARES_CHECKED_EVERY == 0 and self.settings.bound != "obgd" and not kernels.is_finite(self._memory[2]):
+            self.engine.flat.values.fill_(math.nan)
 
     def clear(self) -> None:
         self.z.zero_()

@@ -9,14 +9,29 @@ import math
 
 import numpy as np
 
-from neuralq.jit import reassociating_kernel
+from neuralq.jit import kernel, reassociating_kernel
 from neuralq.types import Array
 
-__all__ = ["ADAPTIVE", "INTENTIONAL", "OBGD", "advance"]
+__all__ = ["ADAPTIVE", "INTENTIONAL", "OBGD", "advance", "is_finite"]
 
 
 OBGD, ADAPTIVE, INTENTIONAL = 0, 1, 2
 _EPSILON, _CLIP, _CLIP_DECAY = 1e-8, 20.0, 0.9998  # as in neuralq.rules.streaming
+
+
+@kernel
+def is_finite(v: Array) -> bool:
+    """Whether no running square has overflowed: such a weight would stop for ever, without a word."""
+    return bool(v.max() < np.inf)
+
+
+@kernel
+def _wide_norm(z: Array, v: Array, bound: int, correction: float) -> float:
+    """The norm of the direction, where float32 cannot hold it."""
+    norm = 0.0
+    for i in range(z.size):
+        norm += abs(np.float64(z[i])) / (1.0 if bound == OBGD else np.sqrt(v[i] * correction + _EPSILON))
+    return norm
 
 
 @reassociating_kernel
@@ -37,7 +52,10 @@ def _advance_bounded(
             z[i] = trace_decay * z[i] + grad[i]
             v[i] = old * v[i] + new * z[i] * z[i]
             norm += abs(z[i]) / np.sqrt(v[i] * correction + epsilon)
-    step = step_size / max(step_size * kappa * max(abs(delta), 1.0) * norm, 1.0)
+    size = float(norm)
+    if not size < np.inf:
+        size = _wide_norm(z, v, bound, np.float64(correction))
+    step = step_size / max(step_size * kappa * max(abs(delta), 1.0) * size, 1.0)
     scaled = kind(step * delta)
     if bound == OBGD:
         for i in range(z.size):
@@ -78,7 +96,8 @@ def advance(
 ) -> None:  # fmt: skip
     """Decay the trace, add the gradient, and move the weights as far as the bound allows.
 
-    ``v`` is empty for OBGD. ``rate`` is 1 − γλ, of the running mean σ in ``means[0]``; ``means[1]`` is that of δ².
+    ``v`` is empty for OBGD. ``rate`` is 1 − γλ, of the running mean σ in ``means[0]``; ``means[1]`` is that of δ². At a
+    rate of 0 there is no such mean: `neuralq.rules.intentional` has its limit.
     """
     if bound == INTENTIONAL:
         _advance_intentional(values, z, v, grad, means, decay, delta, rate, step_size, beta2, num_updates)

@@ -21,7 +21,7 @@ import math
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (np.dot in kernels uses it; loaded here, thread limits set later reach it)
 
-from neuralq.jit import reassociating_kernel
+from neuralq.jit import kernel, reassociating_kernel
 from neuralq.q.kernels.products import multiply, suits
 from neuralq.types import Array
 
@@ -36,6 +36,7 @@ __all__ = [
     "all_values",
     "loss_gradient",
     "through_activation",
+    "wide_inverse",
 ]
 
 
@@ -54,6 +55,15 @@ def _activate(v: float, activation: int) -> float:
     return v if v > 0 else v * 0.01
 
 
+@kernel
+def wide_inverse(y: Array, mean: float) -> float:
+    """1/σ of a row whose squares float32 cannot hold; 0 would make it a constant without a word."""
+    total = 0.0
+    for j in range(y.size):
+        total += (np.float64(y[j]) - np.float64(mean)) * (np.float64(y[j]) - np.float64(mean))
+    return 1.0 / math.sqrt(total / y.size + LAYER_NORM_EPS)
+
+
 @reassociating_kernel
 def _normalise_rows(y: Array, scale: Array, shift: Array, hat: Array, inverse: Array, activation: int) -> None:
     rows, width = y.shape
@@ -66,6 +76,8 @@ def _normalise_rows(y: Array, scale: Array, shift: Array, hat: Array, inverse: A
         for j in range(width):
             spread += (y[i, j] - mean) * (y[i, j] - mean)
         inv = y.dtype.type(1.0 / math.sqrt(spread / width + LAYER_NORM_EPS))
+        if not spread < np.inf:
+            inv = y.dtype.type(wide_inverse(y[i], mean))
         inverse[i] = inv
         if scale.size > 0:
             for j in range(width):

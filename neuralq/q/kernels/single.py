@@ -20,8 +20,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from neuralq.jit import reassociating_kernel
-from neuralq.q.kernels.batch import LAYER_NORM_EPS, through_activation
+from neuralq.q.kernels.batch import LAYER_NORM_EPS, through_activation, wide_inverse
 from neuralq.types import Array
 
 __all__ = ["CONV", "DENSE", "learn", "values_of"]
@@ -85,6 +87,8 @@ def _normalise(params: Array, row: Array, y: Array, hat: Array) -> Any:
     for j in range(size):
         spread += (y[j] - mean) * (y[j] - mean)
     inv = y.dtype.type(1.0 / math.sqrt(spread / size + LAYER_NORM_EPS))
+    if not spread < np.inf:
+        inv = y.dtype.type(wide_inverse(y, mean))
     for j in range(size):
         h = (y[j] - mean) * inv
         hat[j] = h

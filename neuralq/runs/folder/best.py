@@ -34,12 +34,14 @@ class Best:
         greedy_return: mean return of that evaluation.
         parameters: the flat parameter vector.
         normalisation: statistics through which observations were seen then, or None.
+        scalings: by what they were divided, as `Encoder.scalings` says it; None where nobody wrote it down.
     """
 
     env_steps: int
     greedy_return: float
     parameters: Tensor
     normalisation: dict[str, Any] | None = None
+    scalings: dict[str, Any] | None = None
 
 
 def keep_best(run_dir: str | Path, best: Best, origin: Mapping[str, Any] | None = None) -> Path:
@@ -60,7 +62,7 @@ def keep_best(run_dir: str | Path, best: Best, origin: Mapping[str, Any] | None 
         >>> load_best(folder).greedy_return
         31.5
     """
-    state = {name: getattr(best, name) for name in ("greedy_return", "parameters", "normalisation")}
+    state = {name: getattr(best, name) for name in ("greedy_return", "parameters", "normalisation", "scalings")}
     state["origin"] = None if origin is None else dict(origin)
     return save(Path(run_dir) / BEST_FOLDER, best.env_steps, state, keep=1)
 
@@ -80,6 +82,7 @@ def load_best(run_dir: str | Path) -> Best:
         compared(state.get("origin"), read_config(run_dir), saved.path)
     try:
         parameters = torch.as_tensor(state["parameters"])
-        return Best(saved.step, float(state["greedy_return"]), parameters, state.get("normalisation"))
+        kept = parameters, state.get("normalisation"), state.get("scalings")
+        return Best(saved.step, float(state["greedy_return"]), *kept)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{saved.path} holds no parameters ({error})") from error

@@ -31,6 +31,7 @@ from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resuma
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
+from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
@@ -144,7 +145,8 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     if num_categories is not None and config.layout != "table":
         features, shape = OneHot(num_categories), (num_categories,)
     elif spec.dtype == np.uint8:
-        features = Pixels()
+        scaling = spec.frame_scaling
+        features = Pixels(1.0) if scaling is None else Pixels(scaling.divisor, scaling.origin)
     if config.layout == "table":
         if num_categories is None:
             raise ValueError("a table needs finitely many states; choose another layout")
@@ -238,6 +240,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     normalisation = normalisation_for(config, envs)
     stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
+    require_room(config, stream.spec)
     engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(settings), config.engine)
     learner = _learner(config, engine, stream.spec, generators["samples"])
     experience = _SOURCES[config.kind.experience](settings, stream.spec, generators["samples"])
@@ -250,7 +253,8 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
-        config.seed, config.evaluation_episodes, cap, config.evaluate_every,
+        config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+        _value_range(config.settings),
     )  # fmt: skip
 
 
@@ -272,6 +276,11 @@ def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
         np.random.default_rng(seed_for(config.seed, 6)),
         PROBE_SECONDS,
     )
+
+
+def _value_range(settings: Any) -> tuple[float, float] | None:
+    low, high = getattr(settings, "value_min", None), getattr(settings, "value_max", None)
+    return None if low is None or high is None else (low, high)
 
 
 def engine_name(learner: Learner) -> str:
@@ -317,8 +326,15 @@ def _rollouts(settings: Any, spec: ObservationSpec, rng: np.random.Generator) ->
 
 
 def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
+    buffer = _buffer(settings, spec, settings.capacity)
+    if settings.block_length > max(1, buffer.least_steps):
+        raise ValueError(
+            f"capacity={settings.capacity} may hold no block of block_length={settings.block_length}: observations of "
+            "this size are stored once where streams go on, and short episodes take twice the room; take at least "
+            f"{2 * settings.block_length * settings.num_envs}"
+        )
     return ReplayExperience(
-        _buffer(settings, spec, settings.capacity), rng, settings.batch_size, settings.block_length,
+        buffer, rng, settings.batch_size, settings.block_length,
         settings.learning_starts, settings.train_period, settings.updates_per_period,
     )  # fmt: skip
 

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from numbers import Real
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from neuralq.checks import MOST_WHOLE, check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
@@ -19,6 +21,11 @@ __all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
 NETWORKS = ("action-input", "separate", "action-output")
+_COUNTS = (
+    *("total_steps", "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every", "threads"),
+    "epsilon_decay_steps",
+)
+_SINGLE = np.finfo(np.float32)
 _MOST_THREADS = 4096
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
 _Class = TypeVar("_Class")
@@ -121,18 +128,11 @@ class RunConfig:
         check_choice("engine", self.engine, ("auto", "torch", "compiled"))
         check_discount("gamma", self.gamma)
         check_positive("reward_scale", self.reward_scale)
+        _check_single(self)
         check_fraction("epsilon_start", self.epsilon_start)
         check_fraction("epsilon_end", self.epsilon_end)
         check_whole("seed", self.seed, 0)
-        for name in (
-            "total_steps",
-            "evaluate_every",
-            "evaluation_episodes",
-            "checkpoint_every",
-            "log_every",
-            "threads",
-            "epsilon_decay_steps",
-        ):
+        for name in _COUNTS:
             check_whole(name, getattr(self, name))
         if self.threads > _MOST_THREADS:
             raise ValueError(f"threads must be at most {_MOST_THREADS:,}, got {self.threads:,}")
@@ -147,6 +147,7 @@ class RunConfig:
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
                     f"use learner={name!r} or leave them out"
                 )
+        object.__setattr__(self, self.learner, _fitted_settings(self.learner, self.settings, self.kind.settings))
         _check_body(self)
         _check_outputs(self)
         self.kind.check(self.settings, self)
@@ -170,6 +171,17 @@ def _check_body(config: RunConfig) -> None:
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
     if config.engine == "compiled" and (config.layout not in NETWORKS or not isinstance(config.body or MLP(), MLP)):
         raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+
+
+def _check_single(config: RunConfig) -> None:
+    """Networks and replay compute in float32, which must be able to tell γ from 1 and the scale from 0."""
+    if config.layout not in NETWORKS and LEARNERS[config.learner].experience != "replay":
+        return
+    gamma, scale = float(np.float32(config.gamma)), config.reward_scale
+    if gamma == 1 and config.gamma < 1:
+        raise ValueError(f"gamma={config.gamma!r} is 1 in float32, which networks compute in; use 1, or 0.9999999")
+    if not float(_SINGLE.tiny) <= scale <= float(_SINGLE.max):
+        raise ValueError(f"reward_scale={scale!r} is beyond float32, which networks compute in; use one nearer 1")
 
 
 def _check_outputs(config: RunConfig) -> None:
@@ -257,6 +269,16 @@ def _body_of(given: Any) -> dict[str, Any]:
             f"body must be a mapping with a class, one of {known}, or 'module:Class' of your own, got {given!r}"
         )
     return dict(given)
+
+
+def _fitted_settings(place: str, settings: Any, known: type) -> Any:
+    """``settings`` with every value of its field's kind: 1.0 is a whole number too, but no length of an array."""
+    if not isinstance(settings, known):
+        raise ValueError(f"{place} must be {known.__name__}, got {settings!r}")
+    given = {one.name: getattr(settings, one.name) for one in dataclasses.fields(cast(Any, known))}
+    fitted = _fitted(place, given, known)
+    same = all(type(fitted[name]) is type(value) for name, value in given.items())
+    return settings if same else dataclasses.replace(cast(Any, settings), **fitted)
 
 
 def _fitted(place: str, given: Any, known: type) -> dict[str, Any]:

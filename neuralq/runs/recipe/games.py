@@ -22,6 +22,7 @@ import numpy as np
 from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
 import neuralq_envs
+from neuralq.checks import check_module_name
 
 __all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "refusals_name", "register_games"]
 
@@ -72,6 +73,8 @@ def refusals_name(env: str) -> Iterator[None]:
         >>> with refusals_name("CartPole-v1"):
         ...     _ = gym.make("CartPole-v1")
     """
+    if ":" in env:
+        check_module_name("the environment", env.rpartition(":")[0], env)
     try:
         yield
     except gym.error.Error as error:

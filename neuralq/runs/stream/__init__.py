@@ -8,8 +8,9 @@ caller, who asks for it here. What is experienced is the same in all three (test
 
 from __future__ import annotations
 
+from neuralq.runs.stream.faults import EnvironmentFault, faults_of
 from neuralq.runs.stream.normalisation import Normalisation
-from neuralq.runs.stream.stream import EnvironmentFault, Episode, Interaction, ObservationSpec, Policy, Step, interact
+from neuralq.runs.stream.stream import Episode, Interaction, ObservationSpec, Policy, Step, interact
 from neuralq.runs.stream.vector_env import MASK_METHODS, SubEnv, SubEnvFault, legal_actions, make_vector_env
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "Step",
     "SubEnv",
     "SubEnvFault",
+    "faults_of",
     "interact",
     "legal_actions",
     "make_vector_env",

@@ -1,9 +1,10 @@
 """Observation spaces to arrays: what an environment hands out becomes what a value function takes.
 
-Two targets. *Arrays* for networks and linear features: a `Box` stays as it is (float32; frames keep uint8 or bool), a
-`Discrete` becomes a state index that `OneHot` widens inside the network, everything composite becomes one flat float32
-vector with a one-hot block for each discrete part, in the order of `gymnasium.spaces.utils.flatten`. *Indices* for
-tables: every finite space becomes one whole number in mixed radix, the first part the most significant digit.
+Two targets. *Arrays* for networks and linear features: a `Box` becomes float32, scaled by its bounds
+(`neuralq.runs.stream.scaling`; frames keep uint8 or bool, and the network scales them), a `Discrete` becomes a state
+index that `OneHot` widens inside the network, everything composite becomes one flat float32 vector with a one-hot block
+for each discrete part, in the order of `gymnasium.spaces.utils.flatten`. *Indices* for tables: every finite space
+becomes one whole number in mixed radix, the first part the most significant digit.
 
 Batches come as Gymnasium's vector environments give them: an array with one row per environment for `Box`, `Discrete`,
 `MultiDiscrete` and `MultiBinary`, a tuple of batches for `Tuple`, a dict of batches for `Dict`. Whatever is encoded is
@@ -14,15 +15,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from gymnasium import Space, spaces
 
+from neuralq.runs.stream.scaling import Scaling, scaling_of
 from neuralq.types import Array
 
-__all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "discrete_actions", "encoder_for"]
+__all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "Part", "discrete_actions", "encoder_for"]
 
 MAX_TABLE_STATES = 10_000_000
 """The most states that a table is built for; beyond it a table is no longer the right representation."""
@@ -65,8 +67,8 @@ def _name(keys: tuple[int | str, ...]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """One array of an observation, where to find it and what it must look like."""
+class Part:
+    """One array of an observation: where to find it, what it must look like, and how it is encoded."""
 
     keys: tuple[int | str, ...]
     shape: tuple[int, ...]
@@ -76,13 +78,20 @@ class _Part:
     starts: Array = field(default_factory=_nothing, compare=False, repr=False)
     limits: Array = field(default_factory=_nothing, compare=False, repr=False)
     columns: Array = field(default_factory=_nothing, compare=False, repr=False)
+    scaling: Scaling | None = field(default=None, compare=False, repr=False)  # of a Box
 
     @property
     def width(self) -> int:
         """Entries that this part takes in a flat vector."""
-        return math.prod(self.shape) if self.sizes is None or self.kinds == _BINARY else sum(self.sizes)
+        return math.prod(self.shape) if self.sizes is None or self.is_binary else sum(self.sizes)
+
+    @property
+    def is_binary(self) -> bool:
+        """Whether its entries are bits, which stand in a flat vector as they are."""
+        return self.kinds == _BINARY
 
     def find(self, observation: Any) -> Any:
+        """This part of an observation, or of a batch."""
         for depth, key in enumerate(self.keys):
             kind: type[Any] = dict if isinstance(key, str) else tuple
             try:
@@ -109,14 +118,16 @@ class _Part:
             raise ObservationError(f"must be {wanted}, got dtype {array.dtype}; {way_out}", field=_name(self.keys))
         return array
 
-    def floats(self, batch: Any) -> Array:
-        """A fresh float32 copy ``[N, *shape]`` of a Box part, finite throughout."""
+    def floats(self, batch: Any, dtype: np.dtype[Any]) -> Array:
+        """A fresh copy ``[N, *shape]`` of a Box part, scaled and finite throughout."""
         array = self.read(batch)
-        if array.dtype == np.float32:
+        if self.scaling is None and array.dtype == dtype:
             copy = array.copy()
         else:
+            # In float64, where a large offset loses nothing; of numbers that float32 holds the rounding is the same.
+            wide = array if self.scaling is None else self.scaling.apply(array)
             with np.errstate(over="ignore"):  # beyond float32 becomes inf, which is refused below
-                copy = array.astype(np.float32)
+                copy = wide.astype(dtype)
         if array.dtype.kind == "f" and np.count_nonzero(np.isfinite(copy)) < copy.size:
             self._refuse_not_finite(array, copy)
         return copy
@@ -143,8 +154,8 @@ class _Part:
     def write(self, batch: Any, out: Array) -> None:
         """Fill ``out [N, width]`` (zeros) with this part: values, bits or one-hot blocks."""
         if self.sizes is None:
-            out[:] = self.floats(batch).reshape(out.shape)
-        elif self.kinds == _BINARY:
+            out[:] = self.floats(batch, out.dtype).reshape(out.shape)
+        elif self.is_binary:
             out[:] = self.digits(batch)
         else:
             out[np.arange(len(out))[:, None], self.digits(batch) + self.columns] = 1.0
@@ -158,15 +169,46 @@ class Encoder:
 
     Args:
         shape: shape of one encoded observation, without the axis of environments.
-        dtype: float32, uint8 or bool (frames) or int64 (state indices).
+        dtype: float32 (float64 where that was asked for), uint8 or bool (frames) or int64 (state indices).
         num_categories: number of states when the encoded observation is a state index (shape ``()``), else None.
+        layout: what becomes of the parts: an "array" or an "image" of its own, one "vector" of all, or an "index".
+        parts: the arrays that an observation consists of.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     num_categories: int | None
-    _layout: Literal["array", "image", "vector", "index"]
-    _parts: tuple[_Part, ...]
+    layout: Literal["array", "image", "vector", "index"]
+    parts: tuple[Part, ...]
+
+    @property
+    def frame_scaling(self) -> Scaling | None:
+        """Of frames, which are encoded as they are: how the network is to scale them. Other numbers are scaled."""
+        return self.parts[0].scaling if self.layout == "image" else None
+
+    @property
+    def scalings(self) -> dict[str, list[list[float]]]:
+        """Origin and divisor of every part that is scaled, here or in the network, by its name."""
+        return {_name(part.keys): part.scaling.plain() for part in self.parts if part.scaling is not None}
+
+    def require_scalings(self, saved: Mapping[str, Any] | None) -> None:
+        """Refuse what was learned from observations that were scaled otherwise.
+
+        Args:
+            saved: `scalings` of then; None where nobody wrote them down, when frames of bytes were divided by 255 and
+                nothing else was scaled.
+
+        Raises:
+            ValueError: with the way out.
+        """
+        bytes_ = self.layout == "image" and self.dtype == np.uint8
+        then = ({"observation": [[0.0], [255.0]]} if bytes_ else {}) if saved is None else dict(saved)
+        if then != self.scalings:
+            raise ValueError(
+                "the observations of this run were scaled otherwise when it learned: its environment had other bounds, "
+                "or its version of neuralq took bytes, and nothing else, for 0..255; train it anew, or use it with "
+                "both as they were"
+            )
 
     def encode(self, batched_observation: Any) -> Array:
         """A fresh array ``[N, *shape]`` of the batch of N observations.
@@ -180,16 +222,16 @@ class Encoder:
             >>> encoder.encode({"speed": np.array([[0.5], [-0.5]], np.float32), "gear": np.array([2, 0])}).tolist()
             [[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, -0.5]]
         """
-        if self._layout == "array":
-            return self._parts[0].floats(batched_observation)
-        if self._layout == "image":
-            return self._parts[0].read(batched_observation).copy()
-        if self._layout == "index":
+        if self.layout == "array":
+            return self.parts[0].floats(batched_observation, self.dtype)
+        if self.layout == "image":
+            return self.parts[0].read(batched_observation).copy()
+        if self.layout == "index":
             return self._index(batched_observation)
         num_envs = self._num_envs(batched_observation)
-        out = np.zeros((num_envs, *self.shape), np.float32)
+        out = np.zeros((num_envs, *self.shape), self.dtype)
         offset = 0
-        for part in self._parts:
+        for part in self.parts:
             part.write(batched_observation, out[:, offset : offset + part.width])
             offset += part.width
         return out
@@ -204,7 +246,7 @@ class Encoder:
             >>> encoder_for(spaces.Discrete(3, start=5)).encode_single(6).item()
             1
         """
-        nested = bool(self._parts[0].keys)
+        nested = bool(self.parts[0].keys)
         try:
             encoded = self.encode(_add_env_axis(observation) if nested else _as_array(observation)[None])
         except ObservationError as error:
@@ -214,27 +256,28 @@ class Encoder:
 
     def _index(self, batch: Any) -> Array:
         index = np.zeros(self._num_envs(batch), np.int64)
-        for part in self._parts:  # Horner's rule
+        for part in self.parts:  # Horner's rule
             digits = part.digits(batch)
             for entry, size in enumerate(part.sizes or ()):
                 index = index * size + digits[:, entry]
         return index
 
     def _num_envs(self, batch: Any) -> int:
-        lengths = [len(part.read(batch)) for part in self._parts]
-        for part, length in zip(self._parts, lengths, strict=True):
+        lengths = [len(part.read(batch)) for part in self.parts]
+        for part, length in zip(self.parts, lengths, strict=True):
             if length != lengths[0]:
-                problem = f"has {length} rows where {_name(self._parts[0].keys)} has {lengths[0]}"
+                problem = f"has {length} rows where {_name(self.parts[0].keys)} has {lengths[0]}"
                 raise ObservationError(f"{problem}; every part needs one row per environment", field=_name(part.keys))
         return lengths[0]
 
 
-def encoder_for(space: Space[Any], *, as_index: bool = False) -> Encoder:
+def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False) -> Encoder:
     """The encoder of an observation space: arrays for networks and linear features, or one state index for a table.
 
     Args:
         space: the space of a single environment (``envs.single_observation_space``).
         as_index: encode as one whole number; only for finite spaces.
+        wide: numbers as float64 and not scaled, for whoever normalises them before they become float32; frames too.
 
     Raises:
         ValueError: the space has no batched form or holds nothing, or no index exists (a `Box`, or more than
@@ -249,21 +292,24 @@ def encoder_for(space: Space[Any], *, as_index: bool = False) -> Encoder:
         [9]
     """
     parts = tuple(_parts_of(space, ()))
-    if not parts:
-        raise ValueError(f"{space} holds nothing to observe; give it at least one part, for example Discrete(1)")
+    if not any(part.width for part in parts):
+        raise ValueError(f"{space} holds nothing to observe; give it at least one number, for example Discrete(1)")
+    numbers: np.dtype[Any] = np.dtype(np.float32)
+    if wide:
+        numbers, parts = np.dtype(np.float64), tuple(replace(part, scaling=None) for part in parts)
     if as_index:
         return Encoder((), np.dtype(np.int64), _count_states(space, parts), "index", parts)
     if isinstance(space, spaces.Discrete):
         return Encoder((), np.dtype(np.int64), int(space.n), "index", parts)
     if isinstance(space, spaces.Box):
-        if parts[0].dtype in _FRAMES and len(space.shape) >= 2:
+        if parts[0].dtype in _FRAMES and len(space.shape) >= 2 and not wide:
             return Encoder(space.shape, parts[0].dtype, None, "image", parts)
-        return Encoder(space.shape, np.dtype(np.float32), None, "array", parts)
+        return Encoder(space.shape, numbers, None, "array", parts)
     width = sum(part.width for part in parts)
-    return Encoder((width,), np.dtype(np.float32), None, "vector", parts)
+    return Encoder((width,), numbers, None, "vector", parts)
 
 
-def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]:
+def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[Part]:
     if isinstance(space, spaces.Tuple):
         for position, inner in enumerate(space.spaces):
             yield from _parts_of(inner, (*keys, position))
@@ -272,7 +318,8 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]
             yield from _parts_of(inner, (*keys, key))
     elif isinstance(space, spaces.Box):
         dtype = np.dtype(space.dtype)
-        yield _Part(keys, space.shape, _WHOLE if dtype.kind in _WHOLE else dtype.kind, dtype, None)
+        kinds = _WHOLE if dtype.kind in _WHOLE else dtype.kind
+        yield Part(keys, space.shape, kinds, dtype, None, scaling=scaling_of(space))
     elif isinstance(space, spaces.Discrete):
         yield _discrete_part(keys, (), _WHOLE, space, np.array([space.n]), np.array([space.start]))
     elif isinstance(space, spaces.MultiDiscrete):
@@ -290,14 +337,14 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[_Part]
 
 def _discrete_part(
     keys: tuple[int | str, ...], shape: tuple[int, ...], kinds: str, space: Space[Any], sizes: Array, starts: Array
-) -> _Part:
+) -> Part:
     limits = sizes.astype(np.int64)
     columns = np.cumsum(limits) - limits
     dtype = np.dtype(space.dtype)
-    return _Part(keys, shape, kinds, dtype, tuple(limits.tolist()), starts.astype(np.int64), limits, columns)
+    return Part(keys, shape, kinds, dtype, tuple(limits.tolist()), starts.astype(np.int64), limits, columns)
 
 
-def _count_states(space: Space[Any], parts: tuple[_Part, ...]) -> int:
+def _count_states(space: Space[Any], parts: tuple[Part, ...]) -> int:
     way_out = "choose another layout (linear, action-input, separate, action-output)"
     for part in parts:
         if part.sizes is None:

@@ -2,7 +2,9 @@
 
 Observations are centred and divided by their standard deviation so far, (s − mean)/√(var + 1e-8), each when it arrives:
 what was learned from is not rewritten later. Rewards are divided by √(var(u) + 1e-8), where u ← γ(1 − end)u + r is the
-discounted sum up to now. The statistics are Welford's (1962), with the sample variance, which is 1 until there are two.
+discounted sum up to now. The statistics are Welford's (1962), with the sample variance, which is 1 until there are two,
+and while all that was seen is the same: nothing is divided by a spread that nobody saw. Nothing is seen further than
+`CLIP` standard deviations from the mean.
 
 The statistics are part of the stream, and of what a checkpoint holds: an agent without them would see another world.
 """
@@ -18,8 +20,11 @@ from neuralq.checks import check_discount, check_whole
 from neuralq.jit import kernel
 from neuralq.types import Array
 
-__all__ = ["Normalisation"]
+__all__ = ["CLIP", "Normalisation"]
 
+CLIP = 100.0
+"""Standard deviations beyond which nothing is seen: what was as good as constant is not worth more when it moves. In
+the first 10,000 steps of training no observation is further away than that."""
 _EPSILON = 1e-8
 
 
@@ -33,7 +38,7 @@ def _take_in(x: float, n: float, j: int, mean: Array, squares: Array) -> None:
 
 @kernel
 def _spread(squares: float, n: float) -> Any:
-    return np.sqrt((squares / (n - 1) if n > 1 else 1.0) + _EPSILON)
+    return np.sqrt((squares / (n - 1) if n > 1 and squares > 0 else 1.0) + _EPSILON)
 
 
 @kernel
@@ -50,7 +55,7 @@ def _scaled(x: Array, count: Array, mean: Array, squares: Array, out: Array) -> 
     for j in range(mean.size):
         inv = 1.0 / _spread(squares[j], count[0])
         for i in range(x.shape[0]):
-            out[i, j] = (x[i, j] - mean[j]) * inv
+            out[i, j] = min(max((x[i, j] - mean[j]) * inv, -CLIP), CLIP)
 
 
 @kernel
@@ -110,26 +115,30 @@ class Normalisation:
         return view
 
     def observe(self, x: Array, env_indices: Array | None = None) -> Array:
-        """Learn from the rows ``env_indices`` (all if None); returns every row normalised, ``[N, *shape]`` float32."""
+        """Learn from the rows ``env_indices`` (all if None); returns every row normalised, ``[N, *shape]`` float32.
+
+        Rows come as float64 where they have that: a mean of 1e9 is subtracted before float32 rounds.
+        """
         if not self.observations:
             return x
         state = self._state
         stats = state["observation_count"], state["observation_mean"], state["observation_squares"]
-        rows = np.ascontiguousarray(x, np.float32).reshape(len(x), self._size)
+        rows = np.ascontiguousarray(x, np.float64).reshape(len(x), self._size)
         if self._learning:
             _learn(rows, self._everyone[: len(x)] if env_indices is None else env_indices, *stats)
-        out = np.empty_like(rows)
+        out = np.empty(rows.shape, np.float32)
         _scaled(rows, *stats, out)
         return out.reshape(x.shape)
 
     def scaling(self) -> tuple[Array, Array] | None:
         """Mean and inverse spread of the observations so far, each ``[d]``: they are seen as (s − mean) · inverse.
 
-        None where observations are not normalised.
+        That is clipped to ±`CLIP`. None where observations are not normalised.
         """
+        if not self.observations:
+            return None
         count, squares = self._state["observation_count"][0], self._state["observation_squares"]
-        var = squares / (count - 1) if count > 1 else np.ones(self._size)
-        return (self._state["observation_mean"].copy(), 1.0 / np.sqrt(var + _EPSILON)) if self.observations else None
+        return self._state["observation_mean"].copy(), np.array([1.0 / _spread(x, count) for x in squares])
 
     def reward(self, r_t: Array, last_t: Array, moved: Array) -> Array:
         """Rewards ``[N]`` over the spread of discounted sums; environments that did not move teach nothing."""
@@ -144,7 +153,7 @@ class Normalisation:
     def reward_scale(self) -> float:
         """By what rewards are multiplied now."""
         count, squares = self._state["return_count"][0], self._state["return_squares"][0]
-        return float(1.0 / np.sqrt(squares / (count - 1) + _EPSILON)) if self.rewards and count > 1 else 1.0
+        return float(1.0 / _spread(squares, count)) if self.rewards and count > 1 else 1.0
 
     def state_dict(self) -> dict[str, Any]:
         """The statistics."""

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from neuralq.checks import check_discount
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
+from neuralq.runs.stream.faults import EnvironmentFault, describe_error
 from neuralq.runs.stream.normalisation import Normalisation
-from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
+from neuralq.runs.stream.scaling import Scaling
+from neuralq.runs.stream.vector_env import SubEnv
 from neuralq.types import Array, Transition
 
-__all__ = ["EnvironmentFault", "Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
+__all__ = ["Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
 
 
 class Policy(Protocol):
@@ -32,10 +34,6 @@ class Policy(Protocol):
         ...
 
 
-class EnvironmentFault(RuntimeError):
-    """An environment broke its contract; says which one, when and in which field."""
-
-
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
     """What a representation is handed.
@@ -47,6 +45,7 @@ class ObservationSpec:
         num_categories: number of states if the observation is a state index, else None.
         masked: whether an action mask is appended.
         num_actions: A.
+        frame_scaling: of frames of bytes, how the network is to scale them; other numbers are scaled already.
     """
 
     shape: tuple[int, ...]
@@ -55,6 +54,7 @@ class ObservationSpec:
     num_categories: int | None
     masked: bool
     num_actions: int
+    frame_scaling: Scaling | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,9 @@ class Interaction:
         self.normalisation = normalisation
         self.num_envs: int = envs.num_envs
         self.discount = float(discount)
-        self.encoder: Encoder = encoder_for(envs.single_observation_space, as_index=as_index)
+        # Centred before they are rounded to float32, which knows 1e9 and 1e9 + 1 as one number.
+        wide = normalisation is not None and normalisation.observations
+        self.encoder: Encoder = encoder_for(envs.single_observation_space, as_index=as_index, wide=wide)
         self.num_actions, self._first_action = discrete_actions(envs.single_action_space)
         self.mode = _autoreset_mode(envs)
         inner = envs.unwrapped
@@ -136,8 +138,9 @@ class Interaction:
     def _describe(self) -> ObservationSpec:
         encoder, masked = self.encoder, self._mask is not None
         return ObservationSpec(
-            self._s.shape[1:], self._s.dtype, encoder.shape, encoder.num_categories, masked, self.num_actions
-        )
+            self._s.shape[1:], self._s.dtype, encoder.shape, encoder.num_categories, masked, self.num_actions,
+            encoder.frame_scaling,
+        )  # fmt: skip
 
     def restart(self, seed: int | None) -> None:
         """Reset every environment: an episode boundary in all of them.
@@ -148,7 +151,7 @@ class Interaction:
         try:
             observation, info = self.envs.reset(seed=seed)
         except (Exception, SystemExit) as error:
-            raise self._fault(f"at reset, {_describe_error(error)}") from error
+            raise self._fault(f"at reset, {describe_error(error)}") from error
         self._pending[:] = False
         self._returns[:] = 0
         self._lengths[:] = 0
@@ -161,22 +164,29 @@ class Interaction:
 
         Where ``over`` is true the world has ended, and there may be no legal action.
         """
+        encoded = self._normalised(self._encoded(observation), env_indices)
+        self._take_masks(info, env_indices, over)
+        return encoded if self._mask is None else self._with_mask(encoded, self._mask)
+
+    def _encoded(self, observation: Any) -> Array:
         try:
             encoded = self.encoder.encode(observation)
         except ObservationError as error:
             raise self._fault(str(error)) from error
         if len(encoded) != self.num_envs:
             raise self._fault(f"field observation: must have {self.num_envs} rows, got {len(encoded)}")
-        if self.normalisation is not None:
-            encoded = self.normalisation.observe(encoded, env_indices)
+        return encoded
+
+    def _normalised(self, encoded: Array, env_indices: Array) -> Array:
+        return encoded if self.normalisation is None else self.normalisation.observe(encoded, env_indices)
+
+    def _take_masks(self, info: Mapping[str, Any], env_indices: Array, over: Array | None) -> None:
         if self._mask is None and "action_mask" in info:
             if self._begun:
                 raise self._fault("field info['action_mask']: given now but not at the first reset; give it always")
             self._mask = np.ones((self.num_envs, self.num_actions), bool)
-        if self._mask is None:
-            return encoded
-        self._mask[env_indices] = self._legal(info, env_indices, over)
-        return self._with_mask(encoded)
+        if self._mask is not None:
+            self._mask[env_indices] = self._legal(info, env_indices, over)
 
     def _legal(self, info: Mapping[str, Any], env_indices: Array, over: Array | None) -> Array:
         """Action masks of ``env_indices``, ``[k, A]`` bool; an environment without one may do everything."""
@@ -201,10 +211,9 @@ class Interaction:
             legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
         return legal
 
-    def _with_mask(self, encoded: Array) -> Array:
-        assert self._mask is not None
+    def _with_mask(self, encoded: Array, mask: Array) -> Array:
         flat = encoded.reshape(len(encoded), -1)
-        return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
+        return np.concatenate([flat, mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
 
     def _fault_in(self, env_index: int, what: str) -> EnvironmentFault:
         return self._fault(f"environment {env_index}, step {self._lengths[env_index] + 1} of its episode, field {what}")
@@ -230,14 +239,15 @@ class Interaction:
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
         except (Exception, SystemExit) as error:
-            raise self._fault(_describe_error(error)) from error
+            raise self._fault(describe_error(error)) from error
         terminated, truncated = self._flags("terminated", terminated), self._flags("truncated", truncated)
         last = terminated | truncated
         r_t = self._checked_reward(reward)
         ended = np.count_nonzero(last) > 0  # four times as quick as last.any(), here at every step
-        same_step = self.mode is AutoresetMode.SAME_STEP
-        arrived = self._observe(observation, info, self._everyone, None if same_step else terminated)
-        s_t = self._true_successors(arrived, last, terminated, info) if same_step and ended else arrived
+        if ended and self.mode is AutoresetMode.SAME_STEP:
+            s_t, arrived = self._across_the_end(observation, last, terminated, info)
+        else:
+            s_t = arrived = self._observe(observation, info, self._everyone, terminated)
         fake = self._pending
         everyone = np.count_nonzero(fake) == 0
         env_indices = self._everyone if everyone else np.flatnonzero(~fake)
@@ -282,22 +292,35 @@ class Interaction:
             raise self._fault_in(env_index, f"reward: must be finite, got {r_t[env_index]}")
         return r_t
 
-    def _true_successors(self, arrived: Array, last: Array, terminated: Array, info: Mapping[str, Any]) -> Array:
-        """Under SAME_STEP, what the finished episodes really arrived at."""
-        successors = arrived.copy()
-        rows = successors.reshape(self.num_envs, -1)  # a view
-        ended = np.flatnonzero(last)
+    def _across_the_end(
+        self, observation: Any, last: Array, terminated: Array, info: Mapping[str, Any]
+    ) -> tuple[Array, Array]:
+        """Under SAME_STEP, what the finished episodes really arrived at, and where the next ones begin.
+
+        Statistics take them in in this order, as they do where restarting is asked for.
+        """
+        fresh, ended = self._encoded(observation), np.flatnonzero(last)
+        s_t = fresh.copy()
         for env_index in ended:
-            try:
-                encoded = self.encoder.encode_single(info["final_obs"][env_index], env_index=int(env_index))
-            except ObservationError as error:
-                raise self._fault(str(error)) from error
-            if self.normalisation is not None:
-                encoded = self.normalisation.observe(np.asarray(encoded)[None])[0]
-            rows[env_index, : encoded.size] = np.reshape(encoded, -1)
-        if self._mask is not None:
-            successors[ended, -self.num_actions :] = self._legal(info.get("final_info", {}), ended, terminated)
-        return successors
+            s_t[env_index] = self._final(info, int(env_index))
+        arrived = s_t = self._normalised(s_t, self._everyone)
+        arrived = arrived.copy()
+        arrived[ended] = self._normalised(fresh, ended)[ended]
+        self._take_masks(info, self._everyone, None)
+        if self._mask is None:
+            return s_t, arrived
+        mask = self._mask.copy()
+        mask[ended] = self._legal(info.get("final_info", {}), ended, terminated)
+        return self._with_mask(s_t, mask), self._with_mask(arrived, self._mask)
+
+    def _final(self, info: Mapping[str, Any], env_index: int) -> Array:
+        try:
+            return self.encoder.encode_single(info["final_obs"][env_index], env_index=env_index)
+        except (LookupError, TypeError) as error:
+            problem = "info['final_obs']: an environment that restarts in the same step must give the last observation"
+            raise self._fault_in(env_index, f"{problem} there, got {info.get('final_obs')!r}") from error
+        except ObservationError as error:
+            raise self._fault(str(error)) from error
 
     def _finish(self, last: Array, arrived: Array) -> tuple[Episode, ...]:
         """Account for the finished episodes and, where restarting is ours, restart those environments."""
@@ -309,7 +332,7 @@ class Interaction:
             try:
                 observation, info = self.envs.reset(options={"reset_mask": last})
             except (Exception, SystemExit) as error:
-                raise self._fault(_describe_error(error)) from error
+                raise self._fault(describe_error(error)) from error
             fresh = self._observe(observation, info, ended)
             self._s = arrived.copy()
             self._s[ended] = fresh[ended]
@@ -329,6 +352,7 @@ class Interaction:
             "pending": self._pending,
             "mask": self._mask,
             "normalisation": None if self.normalisation is None else self.normalisation.state_dict(),
+            "scalings": self.encoder.scalings,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -342,7 +366,12 @@ class Interaction:
         self.load_normalisation(state)
 
     def load_normalisation(self, state: Mapping[str, Any]) -> None:
-        """Of `state_dict`, the statistics alone: they stay true where the episodes have to start anew."""
+        """Of `state_dict`, the statistics alone: they stay true where the episodes have to start anew.
+
+        Raises:
+            ValueError: the observations of that stream were scaled otherwise.
+        """
+        self.encoder.require_scalings(state.get("scalings"))
         if self.normalisation is not None:
             self.normalisation.load_state_dict(state["normalisation"])
 
@@ -353,14 +382,6 @@ def _act(policy: Policy, s: Array) -> tuple[Array, Array]:
         return on_arrays(s)  # type: ignore[no-any-return]
     action, mu = policy(torch.from_numpy(s))
     return action.numpy(), mu.numpy()
-
-
-def _describe_error(error: BaseException) -> str:
-    if isinstance(error, SubEnvFault | ObservationError):
-        return str(error)
-    if isinstance(error, SystemExit):
-        return f"an environment called sys.exit({'' if error.code is None else repr(error.code)})"
-    return f"an environment raised {type(error).__name__}: {error}"
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any]) -> AutoresetMode:

@@ -1,0 +1,69 @@
+"""Where streams of experience begin, and what they say when an environment fails.
+
+Mutants that die here: environments that begin alike whatever the generator; the step of a fault counted from 0, or not
+at all.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from neuralq.runs.stream import EnvironmentFault, Interaction, interact
+
+
+class Failing(gym.Env[Any, Any]):
+    """Says what its generator drew at reset; its third step of every episode gives what it is told to."""
+
+    def __init__(self, third: float = 0.0, length: int = 4) -> None:
+        self.observation_space, self.action_space = spaces.Box(0, 1, (1,), np.float64), spaces.Discrete(2)
+        self.third, self.length, self.episodes = third, length, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t, self.episodes = 0, self.episodes + 1
+        return self.np_random.random(1), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        reward = self.third if self.t == 3 and self.episodes == 2 else 1.0
+        return np.zeros(1), reward, self.t == self.length, False, {}
+
+
+def push(s: torch.Tensor, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.zeros(len(s), dtype=torch.int64), torch.ones(len(s))
+
+
+def envs_of(mode: AutoresetMode, **kwargs: Any) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: Failing(**kwargs) for _ in range(2)], autoreset_mode=mode)
+
+
+def test_a_stream_begins_where_its_generator_says() -> None:
+    def first(seed: int) -> list[list[float]]:
+        stream = interact(envs_of(AutoresetMode.NEXT_STEP), push, np.random.default_rng(seed))
+        found: list[list[float]] = next(stream).s_tm1.tolist()
+        return found
+
+    assert first(0) == first(0)
+    firsts = [tuple(map(tuple, first(seed))) for seed in range(5)]
+    assert len(set(firsts)) == 5 and all(one != other for one, other in firsts)
+    drawn = int(np.random.default_rng(0).integers(2**31))  # one whole number of 31 bits, as Gymnasium takes seeds
+    assert first(0)[0] == pytest.approx(Failing().reset(seed=drawn)[0].tolist(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("mode", "rows"), [(AutoresetMode.NEXT_STEP, 7), (AutoresetMode.DISABLED, 6)])
+def test_a_fault_is_told_by_environment_and_step(mode: AutoresetMode, rows: int) -> None:
+    stream = Interaction(envs_of(mode, third=float("nan")), 0.9, 0)
+    for _ in range(rows):  # four steps, a wait under NEXT_STEP, and two
+        stream.step(lambda s: push(s, np.random.default_rng(0)))
+    with pytest.raises(EnvironmentFault, match="after 12 environment steps, environment 0, step 3 of its episode"):
+        stream.step(lambda s: push(s, np.random.default_rng(0)))
+    with pytest.raises(EnvironmentFault, match="this interaction has ended with an error"):
+        stream.step(lambda s: push(s, np.random.default_rng(0)))
+    assert stream.running_episodes() == [(2.0, 2), (2.0, 2)]
