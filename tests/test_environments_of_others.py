@@ -379,3 +379,31 @@ def test_what_a_batch_hands_out_has_a_row_for_each_environment(place: int, value
     assert [
         e.env_index for e in stream.step(lambda s: (torch.zeros(2, dtype=torch.int64), torch.ones(2))).episodes
     ] == [1]
+
+
+def test_an_object_of_a_class_without_a_module_is_looked_into_and_one_that_raises_is_told_as_such() -> None:
+    class FromNowhere(type):  # of classes that do not say so, as some of C++ libraries do not
+        def __getattribute__(cls, name: str) -> Any:
+            if name == "__module__":
+                raise AttributeError(name)
+            return super().__getattribute__(name)
+
+    class Nameless(metaclass=FromNowhere):
+        pass
+
+    class Raising:
+        __slots__ = ("held",)
+
+        def __getattribute__(self, name: str) -> Any:
+            raise OSError("no such part")
+
+    env = Other()
+    env.late = Nameless()
+    assert untried(env).exact
+    env.late = Raising()
+    found = untried(env)
+    assert (
+        not found.exact
+        and "cannot be looked into (asked for its parts it raised OSError: no such part)" in found.reason
+    )
+    env.close()

@@ -44,6 +44,7 @@ __all__ = [
     "encode_env",
     "filled_cells",
     "fixed_description",
+    "module_of",
     "spaces_within",
     "type_name",
 ]
@@ -190,6 +191,11 @@ def type_name(value: Any) -> str:
     return f"{getattr(value, '__module__', None)}.{getattr(value, '__qualname__', type(value).__qualname__)}"
 
 
+def module_of(cls: type) -> str:
+    """The name of the module that a class comes from; "" for one of a C++ library that does not say."""
+    return str(getattr(cls, "__module__", ""))
+
+
 def attributes_of(value: Any) -> dict[str, Any]:
     """The attributes of an object that may be state: instance dict and slots by name, without Gymnasium's constants."""
     cls = type(value)
@@ -217,8 +223,8 @@ def constants_of(owner: type) -> frozenset[int]:
     Looked up once per class: constants are there when the class is, and they live as long as it does.
     """
     namespaces: list[Mapping[str, Any]] = [vars(c) for c in owner.__mro__ if c is not object]
-    if owner.__module__ in sys.modules:
-        namespaces.append(vars(sys.modules[owner.__module__]))
+    if module_of(owner) in sys.modules:
+        namespaces.append(vars(sys.modules[module_of(owner)]))
     return frozenset(id(v) for names in namespaces for v in names.values() if v is not None)
 
 
@@ -280,7 +286,7 @@ def _immutable_node(value: Any, path: str) -> dict[str, Any] | None:
         if value.name not in type(value).__members__:
             raise NotCopyable(f"{path} is {value!r}, a combination of flags without a name")
         return {"kind": "enum", "type": type_name(type(value)), "name": value.name}
-    if isinstance(value, _SKIPPED_TYPES) or type(value).__module__.partition(".")[0] == "pygame":
+    if isinstance(value, _SKIPPED_TYPES) or module_of(type(value)).partition(".")[0] == "pygame":
         return {"kind": "skip"}
     description = fixed_description(value)
     return None if description is None else {"kind": "fixed", "value": description}
@@ -350,7 +356,7 @@ def _check_walkable(value: Any, path: str) -> None:
     native = any(
         not c.__flags__ & (1 << 9) for c in cls.__mro__ if c is not object
     )  # 1 << 9: defined by a class statement
-    bound = type(cls) not in (type, ABCMeta) and type(cls).__module__.startswith(_NATIVE_BINDINGS)
+    bound = type(cls) not in (type, ABCMeta) and module_of(type(cls)).startswith(_NATIVE_BINDINGS)
     own_reduce = cls.__reduce_ex__ is not object.__reduce_ex__ or cls.__reduce__ is not object.__reduce__
     has_attributes = hasattr(value, "__dict__") or any("__slots__" in c.__dict__ for c in cls.__mro__)
     is_env = issubclass(cls, gymnasium.Env | VectorEnv)

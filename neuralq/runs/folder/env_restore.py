@@ -34,6 +34,7 @@ from neuralq.runs.folder.env_encode import (
     encode_env,
     filled_cells,
     fixed_description,
+    module_of,
     spaces_within,
     type_name,
 )
@@ -300,7 +301,7 @@ def _class_for(name: str, existing: Any, owner: type, path: str) -> type:
     if type_name(type(existing)) == name:
         return type(existing)
     cls = _loaded_class(name)
-    if cls is None or cls.__module__ != owner.__module__:
+    if cls is None or module_of(cls) != module_of(owner):
         raise NotCopyable(f"{path} was a {name}, and a fresh environment has a {type_name(type(existing))} there")
     return cls
 
