@@ -21,6 +21,9 @@ __all__ = [
 ]
 
 
+_LARGEST = 2**63 - 1
+
+
 class MissingExtra(ImportError):
     """An optional dependency is not installed; the message holds the command that installs it."""
 
@@ -75,11 +78,14 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_whole(name: str, value: int, minimum: int = 1) -> None:
-    """``value`` is a whole number of at least ``minimum`` (a bool is not).
+    """``value`` is a whole number of at least ``minimum`` (a bool is not), and one of 64 bits.
 
     Raises:
         ValueError: otherwise.
     """
+    given: Any = value
+    if isinstance(given, int) and not -_LARGEST <= given <= _LARGEST:  # which need not be a float, nor fit on a line
+        raise ValueError(f"{name} must be a whole number below 2**63, got one of {given.bit_length():,} bits")
     if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < minimum:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import contextlib
 import contextvars
 import difflib
 import importlib
+import io
 import itertools
 import json
+import os
 import re
 import sys
 import traceback
@@ -200,8 +203,37 @@ def _present_folder() -> Iterator[None]:
             sys.path.remove(here)
 
 
+_IN_ASCII = dict(λ="lambda", ε="epsilon", γ="gamma", α="alpha", δ="delta", τ="tau", π="pi", θ="theta")
+_IN_ASCII |= {"±": "+-", "−": "-", "–": "-", "—": "-", "·": "-", "×": "x", "…": "...", "≤": "<=", "≥": ">=", "∞": "inf"}
+_IN_ASCII |= {"→": "->", "←": "<-", "↑": "^", "↓": "v", "½": "1/2", "²": "^2", "√": "sqrt ", "“": '"', "”": '"'}
+_IN_ASCII |= dict.fromkeys("─━╸╺", "-") | dict.fromkeys("│┃", "|") | dict.fromkeys("┌┐└┘├┤┬┴┼╭╮╰╯", "+")
+
+
+def _spelled_out(error: UnicodeError) -> tuple[str, int]:
+    """What stands for characters that the terminal's encoding lacks."""
+    assert isinstance(error, UnicodeEncodeError)
+    return "".join(_IN_ASCII.get(one, "?") for one in error.object[error.start : error.end]), error.end
+
+
+def _make_standard_streams_safe() -> None:
+    """Nothing that is said can fail: neither where a stream is closed, nor for what its encoding lacks.
+
+    What is written to a closed stream is lost, and does not end up in a file that happens to be opened in its place.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            taken = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: the one that was closed
+            mode = "r" if number == 0 else "w"
+            setattr(sys, name, open(taken, mode, encoding="utf-8"))
+    codecs.register_error("neuralq", _spelled_out)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower().replace("-", "") != "utf8":
+            stream.reconfigure(errors="neuralq")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage."""
+    _make_standard_streams_safe()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
