@@ -80,7 +80,7 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_whole(name: str, value: int, minimum: int = 1) -> None:
-    """``value`` is a whole number of at least ``minimum`` (a bool is not).
+    """``value`` is a whole number of at least ``minimum`` (a bool is not), and one of 64 bits.
 
     Raises:
         ValueError: otherwise.

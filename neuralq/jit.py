@@ -19,10 +19,13 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 
-__all__ = ["kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel"]
+__all__ = ["INTERPRETED", "kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+INTERPRETED = bool(getattr(numba.config, "DISABLE_JIT", False))
+"""Whether kernels are run as the Python they are written in (``NUMBA_DISABLE_JIT=1``), for debuggers."""
 
 _njit: Any = numba.njit
 _said = False

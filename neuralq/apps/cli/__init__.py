@@ -9,16 +9,15 @@ import difflib
 import importlib
 import itertools
 import json
-import os
 import re
-import signal
 import sys
-import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
+
+from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
 
 __all__ = [
     "COMMANDS",
@@ -208,27 +207,6 @@ def _present_folder() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _listening() -> Iterator[list[int]]:
-    """Ctrl-C raises KeyboardInterrupt, as ever, and is remembered: raised while kernels load, it may be swallowed."""
-    heard: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        heard.append(number)
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not (
-        signal.default_int_handler
-    ):
-        yield heard
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield heard
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@contextlib.contextmanager
 def _own_output(as_json: bool) -> Iterator[None]:
     """With ``--json`` nothing but the result gets onto standard output; what else is printed goes beside it."""
     token = _output.set(sys.stdout)
@@ -241,10 +219,8 @@ def _own_output(as_json: bool) -> Iterator[None]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status: 0 as asked, 1 not reached or failed, 2 wrong usage, 130 interrupted."""
-    with contextlib.ExitStack() as stack:
-        if sys.stderr is None:  # closed by whoever started us: what is printed there must not get into the result
-            stack.enter_context(contextlib.redirect_stderr(stack.enter_context(open(os.devnull, "w"))))
-        heard = stack.enter_context(_listening())
+    make_standard_streams_safe()
+    with listening() as heard:
         status = _main(argv)
         if heard and status == 0:
             print("neuralq: interrupted", file=sys.stderr)

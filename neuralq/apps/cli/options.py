@@ -18,6 +18,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import yaml  # type: ignore[import-untyped]
 
 from neuralq.apps.cli import DEBUG, Failure
+from neuralq.apps.cli.yaml_text import read_yaml
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
@@ -52,6 +53,7 @@ _EXAMPLES = """examples:
   neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
+_MOST_SEEDS = 10_000
 _WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "print_config"}
 
 
@@ -118,8 +120,12 @@ def _reader(hint: Any) -> Callable[[str], Any]:
     def read(text: str) -> Any:
         value: Any = text
         if hint is not str:
-            with contextlib.suppress(yaml.YAMLError):
-                value = yaml.safe_load(text)
+            try:
+                value = read_yaml(text)
+            except yaml.YAMLError:
+                pass  # a word that is no YAML is what it is
+            except ValueError as error:
+                raise argparse.ArgumentTypeError(f"cannot be read: {error}") from error
             with contextlib.suppress(ValueError):  # YAML 1.1 takes 1e-5 for a word
                 value = float(text) if isinstance(value, str) else value
         try:
@@ -199,15 +205,21 @@ def read_config_file(path: str) -> dict[str, Any]:
     try:
         text = Path(path).read_text(encoding="utf-8")
         try:
-            content = json.loads(text)  # YAML 1.1 takes 1e-05 for a word
-        except ValueError:
-            content = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            content = json.loads(text, object_pairs_hook=_once)  # YAML 1.1 takes 1e-05 for a word
+        except (ValueError, RecursionError):
+            content = read_yaml(text)
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
     content = {} if content is None else content
     if not isinstance(content, dict):
         raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
     return content
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(found := dict(pairs)) < len(pairs):
+        raise ValueError("a key is given twice")
+    return found
 
 
 def _read_file(path: str) -> dict[str, Any]:
@@ -387,6 +399,8 @@ def _check_counts(options: TrainOptions) -> None:
         number = getattr(options, name)
         if number is not None and number < 1:
             raise Failure(f"--{name} must be a whole number of at least 1, got {number}", 2)
+        if number is not None and number > _MOST_SEEDS:
+            raise Failure(f"--{name} must be at most {_MOST_SEEDS:,}, got a number of {number.bit_length()} bits", 2)
     if options.workers is not None and options.seeds is None:
         raise Failure("--workers says how many seeds run at a time; add --seeds or leave it out", 2)
 
@@ -398,8 +412,10 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
     if not values.get("env"):
         raise Failure("name an environment, e.g. neuralq train CartPole-v1", 2)
     layers = [layer.get(learner) or {} for layer in (preset, file, given)]
-    if all(isinstance(layer, dict) for layer in layers):
-        values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    for layer in layers:
+        if not isinstance(layer, dict):
+            raise Failure(f"{learner} must be a mapping, got {layer!r}", 2)
+    values[learner] = {name: value for layer in layers for name, value in layer.items()}
     if "hidden" in short:
         try:
             short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]

@@ -28,6 +28,7 @@ from numpy.typing import DTypeLike
 from torch import Tensor
 
 from neuralq.checks import check_fits, check_fraction, check_whole
+from neuralq.jit import INTERPRETED
 from neuralq.learners.replay.arrays import Batch, Output, Prioritised, as_array, scratch_file
 from neuralq.learners.replay.kernels import RECORD, gather, gather_blocks, locate, store, store_one, synchronise
 from neuralq.learners.replay.sum_tree import SumTree
@@ -121,6 +122,8 @@ class ReplayBuffer:
         shape = (self.num_envs, num_rows, self._row_bytes)
         self._rows: Array = np.zeros(shape, np.uint8) if memory_map is None else scratch_file(Path(memory_map), shape)
         self._records: Array = np.zeros((self.num_envs, self._per_env), RECORD)
+        if INTERPRETED:  # interpreted, fields are found as attributes in record arrays only
+            self._records = self._records.view(np.recarray)
         self._cursors: Indices = np.zeros((self.num_envs, 4), np.int64)  # see replay_kernels
         self._tree = SumTree(steps) if self.prioritised else None
         self._seen: Indices = np.zeros((self.num_envs, 2), np.int64)

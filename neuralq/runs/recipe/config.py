@@ -28,6 +28,7 @@ _COUNTS = (
 _SINGLE = np.finfo(np.float32)
 _MOST_THREADS = 4096
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", dict: "a mapping"}
+_MOST_SHOWN = 100
 _Class = TypeVar("_Class")
 
 if TYPE_CHECKING:
@@ -311,9 +312,9 @@ def fitted_value(name: str, value: Any, hint: Any, given: str | None = None) -> 
     if is_number and isinstance(value, int) and abs(value) >= MOST_WHOLE:
         raise ValueError(f"{name} must be a number below 2^128, got one of {value.bit_length():,} bits".lstrip())
     for kind in kinds:
-        if kind is float and is_number:
+        if kind is float and is_number and _is_float(value):
             return float(value)
-        if kind is int and is_number and float(value).is_integer():
+        if kind is int and is_number and (isinstance(value, int) or float(value).is_integer()):
             return int(value)
         if kind is tuple and isinstance(value, list | tuple):
             return tuple(fitted_value(f"{name}[{i}]", entry, get_args(hint)[0]) for i, entry in enumerate(value))
@@ -321,11 +322,23 @@ def fitted_value(name: str, value: Any, hint: Any, given: str | None = None) -> 
             return value
     words = [_WORDS.get(kind, f"a {kind.__name__}") for kind in kinds if kind is not NoneType]
     words = ["a list" if word == "a tuple" else word for word in words]
-    raise ValueError(f"{name} must be {' or '.join(words)}, got {given or repr(value)}".lstrip())
+    raise ValueError(f"{name} must be {' or '.join(words)}, got {_short(given or repr(value))}".lstrip())
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _MOST_SHOWN else text[: _MOST_SHOWN - 3] + "..."
+
+
+def _is_float(value: Real) -> bool:
+    try:
+        float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return False
+    return True
 
 
 def _refuse_unknown(where: str, given: Mapping[str, Any], known: type) -> None:
     names = {f.name for f in dataclasses.fields(known)}
-    unknown = sorted(set(given) - names)
+    unknown = sorted(map(str, set(given) - names))
     if unknown:
         raise ValueError(f"{where} has unknown keys {', '.join(unknown)}; known are {', '.join(sorted(names))}")
