@@ -147,6 +147,11 @@ def solve(
         return _with_rest(problem, resting, answer, began)
     chosen = _automatic(problem) if method == "auto" else method
     limit = math.inf if max_iterations is None else max_iterations
+    return _solved(problem, chosen, tol, limit, seed, began)
+
+
+def _solved(problem: PlanningProblem, chosen: str, tol: float, limit: float, seed: int, began: float) -> Solution:
+    """The answer of a method, and sweeps after it where it is not good enough."""
     if math.isinf(problem.reach) and chosen != "bellman-ford":
         problem = episodic(problem, chosen)
     if chosen in _TRIALS:
@@ -156,7 +161,7 @@ def solve(
     else:
         found = _SOLVERS[chosen](problem, tol, limit)
     answer = _proven(problem, found, tol, chosen, began)
-    if answer.converged or max_iterations is not None or chosen in _SPANS or not problem.uniform:
+    if answer.converged or math.isfinite(limit) or chosen in _SPANS or not problem.uniform:
         return answer
     return _swept(problem, answer, tol, began)
 
