@@ -29,7 +29,12 @@ INTERPRETED = bool(getattr(numba.config, "DISABLE_JIT", False))
 
 _njit: Any = numba.njit
 _said = False
-_REASSOCIATING = {"reassoc", "contract", "nsz", "arcp"}
+_REASSOCIATES: dict[str, bool | set[str]] = {
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+    # A kernel that another one calls is compiled by itself and as a copy inside the caller, optimised once more. The
+    # process that compiled both would run the first, and one that reads the cache the second, with another order.
+    "forceinline": True,
+}
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -69,7 +74,8 @@ def lean_kernel(function: Callable[P, R]) -> Callable[P, R]:
 def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """As `kernel`, but sums may be added in another order, so that they vectorise.
 
-    The order is fixed when the kernel is compiled: on one machine the same input still gives the same bits. NaN and
+    The order is fixed when the kernel is compiled: on one machine the same input still gives the same bits, in the
+    process that compiles and in those that find the kernel in the cache. NaN and
     infinity keep their meaning.
 
     Example:
@@ -83,7 +89,7 @@ def reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
         >>> total(np.arange(4.0))
         6.0
     """
-    return _compile(function, fastmath=_REASSOCIATING)
+    return _compile(function, **_REASSOCIATES)
 
 
 def lean_reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -100,7 +106,7 @@ def lean_reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
         >>> total(np.arange(4.0))
         6.0
     """
-    return _compile(function, fastmath=_REASSOCIATING, _nrt=False)
+    return _compile(function, **_REASSOCIATES, _nrt=False)
 
 
 def _compile(function: Callable[P, R], **special: bool | set[str]) -> Callable[P, R]:

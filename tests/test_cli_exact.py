@@ -97,3 +97,10 @@ def test_a_time_limit_is_said(capsys: Capture) -> None:
     assert main(["solve", "FrozenLake-v1"]) == 0
     assert "episodes are cut after 100 steps; these are the values without the cut" in capsys.readouterr().out
     assert solved(capsys, "FrozenLake-v1")["max_episode_steps"] == 100
+
+
+def test_values_of_every_size_are_printed_with_their_digits(capsys: Capture) -> None:
+    for reward, seen in (("1e-9", "8.1e-10"), ("1e+9", "8.1e+08")):
+        given = ["neuralq/MitchellGrid-v0", "--gamma", "0.9", "--env-kwargs", f'{{"goal_reward": {reward}}}']
+        assert main(["solve", *given]) == 0
+        assert seen in capsys.readouterr().out

@@ -9,8 +9,11 @@ Mutants that die here: a running mean at the rate 1 − γλ = 0, divided by 1 �
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import itertools
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -19,13 +22,18 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from neuralq import tabular
+from neuralq.learners.gradient.residual import ResidualGradientLearner, ResidualGradientSettings
 from neuralq.learners.kind import learner_kinds
-from neuralq.q import MLP
+from neuralq.mdp import FiniteMDP
+from neuralq.q import MLP, TableQ
+from neuralq.q.engine import Loss, TorchEngine
 from neuralq.rules.streaming import intentional
 from neuralq.runs import RunConfig
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.recipe import build
 from neuralq.runs.recipe.build import build_session
+from neuralq.types import Transition
 
 LEARNERS = learner_kinds()
 BASE: dict[str, dict[str, Any]] = {
@@ -177,3 +185,44 @@ def test_at_gamma_lambda_of_1_the_running_mean_is_the_mean_of_all_steps() -> Non
         z_t = z_t + grad
         step, v, means = intentional(z_t, grad, torch.tensor(1.0).double(), v, means, t + 1, 1.0, 0.5, 0.5)
         assert step.item() == pytest.approx(expected[t], rel=1e-6)
+
+
+TABULAR = [
+    tabular.q_learning, tabular.sarsa, tabular.expected_sarsa, tabular.double_q, tabular.q_lambda, tabular.sarsa_lambda,
+    tabular.n_step, tabular.episodic_q_learning, tabular.dyna_q, tabular.prioritized_sweeping, tabular.queue_dyna,
+]  # fmt: skip
+NOT_NUMBERS = ("seed", "options")
+
+
+@pytest.mark.parametrize("learn", TABULAR, ids=lambda learn: learn.__name__)
+def test_ten_steps_at_every_corner_of_a_tabular_learner(learn: Any) -> None:
+    one = FiniteMDP.from_arrays([[[0.0]]], [[5.0]], substochastic=True)  # one state, one action, one step
+    ring = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]] * 2, [[1.0, -1.0], [0.5, 2.0]])  # which never ends
+    ran = 0
+    for name, parameter in inspect.signature(learn).parameters.items():
+        if parameter.default is inspect.Parameter.empty or name in NOT_NUMBERS:
+            continue
+        numbers = (0, 1, 0.0, 1.0) if name == "step_size" or not isinstance(parameter.default, str) else ()
+        for value in (*numbers, *words(partial(learn, one, 1, 0.5), {}, name)):
+            for world, gamma in itertools.product((one, ring), (0.0, 1.0)):
+                try:
+                    learned = learn(world, 10, gamma, **{name: value})
+                except ValueError as refusal:
+                    assert len(str(refusal)) > 20 and "NaN" not in str(refusal), (name, value)
+                    continue
+                ran += 1
+                assert np.isfinite(learned.q).all(), (name, value, gamma)
+    assert ran >= 16
+
+
+@pytest.mark.parametrize("phi", [0, 1, 0.0, 1.0, "adaptive"])
+@pytest.mark.parametrize("trace_rate", [1, 1.0, 1e-9])
+@pytest.mark.parametrize("discount", [0.0, 1.0])
+def test_ten_updates_at_every_corner_of_the_residual_gradient(phi: Any, trace_rate: float, discount: float) -> None:
+    settings = ResidualGradientSettings(phi=phi, step_size=0.1, trace_rate=trace_rate)
+    learner = ResidualGradientLearner(TorchEngine(TableQ(2, 1), Loss()), settings)
+    row = torch.tensor
+    for t in range(10):
+        s, s_t = row([t % 2]), row([(t + 1) % 2])
+        learner.update(Transition(s, row([0]), row([1.0]), row([1.0]), row([discount]), s_t, row([False])))
+    assert bool(torch.isfinite(learner.engine.flat.values).all())

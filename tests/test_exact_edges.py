@@ -30,6 +30,7 @@ from neuralq.mdp import FiniteMDP
     ("matrix", "step_size", "radius", "converges", "bound", "oscillates", "doubling"),
     [
         ([[2.0]], 0.25, 0.5, True, 1.0, False, None),  # 1 − α λ = ½
+        ([[2.0]], 0.5, 0.0, True, 1.0, False, None),
         ([[2.0]], 0.75, 0.5, True, 1.0, True, None),  # −½
         ([[2.0]], 1.0, 1.0, False, 1.0, True, None),  # −1: neither shrinks nor grows
         ([[2.0]], 1.5, 2.0, False, 1.0, True, 1.0),  # −2: doubles in every step

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from neuralq.apps.cli import main
 from neuralq.exact import METHODS as ALL_METHODS
-from neuralq.exact import Solution, count_optimal_policies, optimal_policies, solve, solve_average
+from neuralq.exact import (
+    Solution,
+    count_optimal_policies,
+    evaluate_average,
+    optimal_policies,
+    solve,
+    solve_average,
+)
 from neuralq.mdp import FiniteMDP
 from neuralq.tabular import Experience, batch_td
 
@@ -68,6 +75,27 @@ def test_every_exit_gives_the_same_values_and_actions_at_a_reach_of_ten_thousand
     assert np.abs(answer.v - v).max() <= answer.bound + 1e-6
     assert answer.bound < 1e-9 * np.abs(v).max()
     assert np.array_equal(answer.optimal_actions, optimal)
+
+
+@pytest.mark.parametrize("method", ["auto", "policy-iteration", "modified-policy-iteration", "linear-programming"])
+def test_an_action_that_is_better_by_less_than_the_error_counts_where_the_reach_is_long(method: str) -> None:
+    # Both actions lead to either state alike, so V = r + γ · mean of V: with actions of 1 and 1 + δ in each state
+    # V = (1 + δ)/(1 − γ) = 10⁶ (1 + δ). Rounding leaves an error of some 10⁻³; δ is below, and adds up to 10⁶ δ.
+    for delta in (1e-3, 1e-6):
+        mdp = FiniteMDP.from_arrays(np.full((2, 2, 2), 0.5), [[1.0, 1.0 + delta], [1.0, 1.0 + delta]])
+        answer = solve(mdp, 1 - 1e-6, method)
+        assert answer.policy.tolist() == [1, 1] and answer.optimal_actions[:, 1].all()
+        assert np.abs(answer.v - 1e6 * (1 + delta)).max() <= answer.bound + 1e-4 and answer.bound < 0.1
+
+
+def test_policies_of_a_random_model_at_a_reach_of_a_million_are_those_of_its_average() -> None:
+    # As γ → 1 a discount-optimal policy earns the best average reward; found by its own equations.
+    mdp = FiniteMDP.garnet(200, 3, 3, seed=1)
+    best = solve_average(mdp).gain
+    for method in ("policy-iteration", "modified-policy-iteration"):
+        answer = solve(mdp, 1 - 1e-6, method)
+        assert evaluate_average(mdp, answer.policy).gain == pytest.approx(best, abs=1e-9)
+        assert answer.bound < 1e-8 * np.abs(answer.v).max()
 
 
 def test_an_early_stop_takes_the_constant_out_as_well() -> None:

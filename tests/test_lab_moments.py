@@ -7,6 +7,8 @@ M V M instead of M V Mᵀ, the crossed term of `_blocks` left out, the second su
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -174,6 +176,9 @@ def test_unknowns_are_counted_and_limited(monkeypatch: pytest.MonkeyPatch) -> No
     for most, known in ((least, True), (least - 1, False)):
         value = moments.known_second_moment(two_states(), one, one.checked({}), 0.01, "markov", most)
         assert (value is not None) == known
+    assert moments.known_second_moment(two_states(), one, one.checked({"lambda_": 0.5}), 0.01, "markov") is None
+    unlearned = dataclasses.replace(one, learner=None)
+    assert moments.known_second_moment(two_states(), unlearned, one.checked({}), 0.01, "markov") is None
     for limit, refused in ((2, False), (1, True)):  # two rows of one number
         monkeypatch.setattr(moments, "LARGEST", limit)
         if refused:

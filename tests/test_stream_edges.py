@@ -18,6 +18,25 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from neuralq.runs.stream import EnvironmentFault, Interaction, interact
 
 
+class Masking(gym.Env[Any, Any]):
+    """Allows one action only, or says nothing of actions."""
+
+    observation_space, action_space = spaces.Box(0, 1, (1,), np.float32), spaces.Discrete(3)
+
+    def __init__(self, masks: bool) -> None:
+        self.masks = masks
+
+    def info(self) -> dict[str, Any]:
+        return {"action_mask": np.array([0, 1, 0], np.int8)} if self.masks else {}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), self.info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(1, np.float32), 0.0, False, False, self.info()
+
+
 class Failing(gym.Env[Any, Any]):
     """Says what its generator drew at reset; its third step of every episode gives what it is told to."""
 
@@ -67,3 +86,24 @@ def test_a_fault_is_told_by_environment_and_step(mode: AutoresetMode, rows: int)
     with pytest.raises(EnvironmentFault, match="this interaction has ended with an error"):
         stream.step(lambda s: push(s, np.random.default_rng(0)))
     assert stream.running_episodes() == [(2.0, 2), (2.0, 2)]
+
+
+def test_an_environment_without_a_mask_may_do_everything_beside_one_that_has_one() -> None:
+    envs = SyncVectorEnv([lambda: Masking(True), lambda: Masking(False)], autoreset_mode=AutoresetMode.DISABLED)
+    stream = Interaction(envs, 0.9, 0)
+    ones = torch.ones(2, dtype=torch.int64)
+    for _ in range(2):
+        step = stream.step(lambda s: (ones, torch.ones(2)))
+        assert step.transition.s_t[:, 1:].tolist() == [[0, 1, 0], [1, 1, 1]]
+
+
+def test_masks_of_a_vector_environment_need_not_say_whose_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    envs = SyncVectorEnv([lambda: Masking(True)] * 2, autoreset_mode=AutoresetMode.DISABLED)
+    reset = envs.reset
+
+    def plain(**kwargs: Any) -> Any:  # Gymnasium's own vector environments add "_action_mask", others need not
+        observation, info = reset(**kwargs)
+        return observation, {"action_mask": info["action_mask"]}
+
+    monkeypatch.setattr(envs, "reset", plain)
+    assert Interaction(envs, 0.9, 0).state_dict()["s"][:, 1:].tolist() == [[0, 1, 0], [0, 1, 0]]

@@ -90,13 +90,13 @@ class _Constant:
         return False
 
 
-def value_iteration(problem: PlanningProblem, tol: float, limit: float) -> Found:
-    """V ← T V until V* is known within ``tol``."""
+def value_iteration(problem: PlanningProblem, tol: float, limit: float, start: Floats | None = None) -> Found:
+    """V ← T V from ``start``, or 0, until V* is known within ``tol``."""
     rows, constant = problem.rows, _Constant(problem, tol)
-    v, better = np.zeros(len(problem.acts)), np.empty(len(problem.acts))
+    v, better = np.zeros(len(problem.acts)) if start is None else start.copy(), np.empty(len(problem.acts))
     iterations, backups, slack, before = 0, 0, np.inf, np.inf
     budget = np.inf  # how far values may move apart until a row that was left out can be the best
-    # |V| never exceeds reach · max |r|, starting from 0; so it need not be looked at after every sweep.
+    # |V| never exceeds reach · max |r|, starting within that; so it need not be looked at after every sweep.
     rounding = 2 * problem.rounding(np.full(1, problem.largest_reward * problem.reach))
     while iterations < limit:
         least, largest, beaten = sweep(rows, v, better, slack + rounding)

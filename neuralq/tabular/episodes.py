@@ -53,7 +53,7 @@ def episodic_q_learning(
     """
     table, ready = new_table(source, options)
     alpha = step_code(step_size, num_steps * (1 + num_replayed))
-    learner = _learner(table, policy, alpha, order, num_replayed, capacity or num_steps)
+    learner = _learner(table, policy, alpha, order, num_replayed, num_steps if capacity is None else capacity)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -95,6 +95,6 @@ def _learner(
     check_choice("order", order, ("reverse", "forward"))
     check_whole("num_replayed", num_replayed, 0)
     check_whole("capacity", capacity)
-    store = new_store(capacity, table.q.shape)
+    store = new_store(int(capacity), table.q.shape)
     arguments = (step_size, store, order == "reverse", num_replayed)
     return Learner(run_episodes, table, acting, arguments, backups=store.counters[BACKUPS:])

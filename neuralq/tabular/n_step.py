@@ -80,5 +80,5 @@ def _learner(table: Table, policy: PolicyLike, step_size: StepCode, rule: str, n
     check_choice("rule", rule, BOOTSTRAPS)
     check_whole("n", n)
     check_expectation(rule, acting)
-    arguments = (step_size, new_window(n), BOOTSTRAPS.index(rule))
+    arguments = (step_size, new_window(int(n)), BOOTSTRAPS.index(rule))
     return Learner(run_n_step, table, acting, arguments, rule == BOOTSTRAPS[SARSA])

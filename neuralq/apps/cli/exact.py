@@ -137,7 +137,7 @@ class _Layout(NamedTuple):
 
     def drawn(self, mdp: FiniteMDP, solution: Solution) -> GridDrawing:
         """V* with an arrow for every optimal move; walls are cells that nothing leads to and nothing leaves."""
-        entered = _entered(mdp)
+        entered, largest = _entered(mdp), float(np.abs(solution.v).max())
         cells = []
         for s in range(mdp.num_states):
             if self.signs[s] != " ":
@@ -148,7 +148,8 @@ class _Layout(NamedTuple):
                 known = np.flatnonzero(solution.optimal_actions[s]) if solution.separated[s] else ()
                 best = sorted(self.directions[a] for a in known)
                 arrows = tuple(map(Arrow, best))
-                cells.append(Square(short(float(solution.v[s])), arrows))
+                v = float(solution.v[s])
+                cells.append(Square(short(v) if largest >= 0.1 else f"{v:.3g}", arrows))
         return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
 
 
@@ -190,6 +191,8 @@ def _legend(layout: _Layout) -> str:
 
 def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
     names, known = mdp.state_names or [""] * mdp.num_states, solution.separated
+    largest = float(np.abs(solution.v).max())
+    shown = "8.4f" if largest == 0 or 0.1 <= largest < 1e6 else "8.4g"  # V is as small or large as rewards are
     lines = ["state        V*  optimal actions"]
     for s in range(min(len(solution.v), _MOST_ROWS)):
         chosen = np.flatnonzero(solution.optimal_actions[s])
@@ -197,7 +200,7 @@ def _table(mdp: FiniteMDP, solution: Solution) -> list[str]:
             " ".join(str(a) if mdp.action_names is None else mdp.action_names[int(a)] for a in chosen) or "terminal"
         )
         actions = actions if known[s] else "not known"
-        lines.append(f"{s:5d}  {solution.v[s]:8.4f}  {actions}{f'  ({names[s]})' if names[s] else ''}")
+        lines.append(f"{s:5d}  {solution.v[s]:{shown}}  {actions}{f'  ({names[s]})' if names[s] else ''}")
     if len(solution.v) > _MOST_ROWS:
         lines.append(f"… and {len(solution.v) - _MOST_ROWS} more states (--json has them all)")
     return lines

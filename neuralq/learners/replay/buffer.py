@@ -194,7 +194,7 @@ class ReplayBuffer:
             ValueError: a wrong environment, an observation of a wrong shape or dtype, or a reward that float32 cannot
                 hold; nothing is stored then.
         """
-        _require_storable(r_t)
+        _check_reward(r_t)
         dtype = self.observation_dtype
         try:  # the quick way first: the checks cost more than the storing
             if (
@@ -227,8 +227,7 @@ class ReplayBuffer:
     def _store(self, env_indices: Indices, values: list[Array]) -> None:
         """Each field as one row without gaps, observations as bytes, reals as float32."""
         s_tm1, a_tm1, *reals, s_t, last_t = (x.ravel() for x in values)
-        largest = float(np.abs(reals[1]).max(initial=0.0))
-        _require_storable(largest)
+        _check_reward(float(np.abs(reals[1]).max(initial=0.0)))
         mu_tm1, r_t, discount_t = (x if x.dtype is _FLOAT32 else x.astype(_FLOAT32) for x in reals)
         s_tm1, s_t = s_tm1.view(np.uint8), s_t.view(np.uint8)
         store(self._records, self._rows, self._cursors, env_indices, s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t)
@@ -414,7 +413,7 @@ _LARGEST_REAL = float(np.finfo(np.float32).max)
 _REAL = (_FLOAT32, np.dtype(np.float64))
 
 
-def _require_storable(r_t: float) -> None:
+def _check_reward(r_t: float) -> None:
     if not abs(r_t) <= _LARGEST_REAL:
         raise ValueError(
             f"a reward of {float(r_t):g} cannot be kept: rewards are stored in float32, up to {_LARGEST_REAL:.2g}; "
