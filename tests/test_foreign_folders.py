@@ -181,6 +181,16 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(name: str, tmp_
         read.get(name, RunFolder.open)(path)
 
 
+@pytest.mark.parametrize("name", ["manifest.json", "state.json", "tensors.safetensors"])
+def test_a_pipe_in_a_checkpoint_is_refused_and_not_waited_for(name: str, short: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(short, tmp_path / "run"))
+    for path in (run / "checkpoints").iterdir():
+        (path / name).unlink()
+        os.mkfifo(path / name)
+    with pytest.raises(checkpoint.CheckpointError, match=f"{name} is a pipe"):
+        load(run)
+
+
 def test_every_changed_bit_of_rows_and_summary_is_noticed(tmp_path: Path) -> None:
     path = a_run(tmp_path / "run")
     rows, summary, seed = read_metrics(path), read_summary(path), read_seed(path)
