@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from typing import Any
 
 from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs import RunConfig, evaluate_run, with_preset
+from neuralq.runs.children import python_command
 from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.recipe.config import config_to_dict
 from neuralq.runs.sweep import Sweep, create_sweep, num_cores, run_sweep
@@ -54,7 +54,7 @@ def command(sweep: Sweep, seed: int) -> list[str]:
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     program = "from neuralq.apps.cli.sweeps import child; child()"
     run = ["--seed", str(seed), "--run-dir", str(sweep.run_path(seed))]
-    return [sys.executable, "-c", program, "train", *config, *run]
+    return [*python_command(program), "train", *config, *run]
 
 
 def measure(env: str, variant: str, seeds: Sequence[int], options: argparse.Namespace) -> dict[str, Any]:

@@ -90,6 +90,12 @@ def world() -> Iterator[None]:
     assert OPEN == [], "an environment was left open"
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing a report takes longer than all the rest, and is not what is asked here."""
+    monkeypatch.setattr("neuralq.apps.cli.runs.write_report", lambda path: path)
+
+
 def config(num_envs: int = 1, **given: Any) -> RunConfig:
     usual: dict[str, Any] = {
         "total_steps": 120, "evaluate_every": 60, "evaluation_episodes": 3, "log_every": 60, "layout": "table"
@@ -297,7 +303,7 @@ def test_what_an_environment_prints_stays_out_of_the_result_and_where_it_goes_it
         assert main([*argv, "--run-dir", name]) == 0
         assert sys.stdout is before
         assert json.loads(capsys.readouterr().out)["run_dir"] == name  # one object, and nothing else
-        assert {"checkpoints", "metrics.jsonl", "report.html"} <= set(os.listdir(tmp_path / name))
+        assert {"checkpoints", "metrics.jsonl", "summary.json"} <= set(os.listdir(tmp_path / name))
     assert os.listdir(tmp_path / "elsewhere") == [] and Path.cwd() == tmp_path
 
 

@@ -44,6 +44,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return train(GRID, tmp_path_factory.mktemp("finished") / "run")
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing a report takes longer than all the rest, and is not what is asked here."""
+    monkeypatch.setattr("neuralq.apps.cli.runs.write_report", lambda path: path)
+
+
 @pytest.fixture
 def copy(finished: Run, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished.run_dir, tmp_path / "run"))
@@ -103,7 +109,7 @@ def test_a_changed_bit_of_the_configuration_never_goes_on_as_another_run(finishe
     saved = load_newest(finished.run_dir / "checkpoints").state["origin"]
     harmless = CONTROL.free | origin.ARITHMETIC
     rng, parsed = random.Random(1), 0
-    for at in rng.sample(range(8 * len(written)), 800):
+    for at in rng.sample(range(8 * len(written)), 500):
         changed = bytearray(written)
         changed[at // 8] ^= 1 << at % 8
         try:

@@ -8,6 +8,8 @@ a Ctrl-C that a compiler swallowed and nobody remembers.
 from __future__ import annotations
 
 import dataclasses
+import io
+import itertools
 import os
 import signal
 import subprocess
@@ -22,6 +24,8 @@ import pytest
 
 import neuralq
 from neuralq.apps import cli
+from neuralq.apps.cli.kinds import say
+from neuralq.apps.cli.progress import training_bar
 from neuralq.learners import RolloutSettings
 from neuralq.runs import RunConfig, control, loop
 from neuralq.runs.control import CONTROL
@@ -274,3 +278,24 @@ def test_no_progress_is_lost_where_a_hook_hears_the_signal(tmp_path: Path) -> No
 
     run = CONTROL.train(CONFIG, tmp_path / "run", [hook])
     assert (run.interrupted_by, run.env_steps) == ("SIGHUP", 40)
+
+
+class Gone(io.StringIO):
+    """A terminal that was closed: whatever is written to it fails."""
+
+    def write(self, text: str) -> int:
+        raise OSError(5, "Input/output error")
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_a_terminal_that_has_gone_costs_what_is_told_and_nothing_else(
+    is_terminal: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = Gone()
+    monkeypatch.setattr(gone, "isatty", lambda: is_terminal)
+    monkeypatch.setattr("sys.stderr", gone)
+    with training_bar(CONTROL, CONFIG, gone, clock=itertools.count(step=60.0).__next__) as bar:
+        bar.say("a line")
+        run = CONTROL.train(CONFIG, tmp_path / "run", [bar])
+    say("another")
+    assert run.env_steps == 160

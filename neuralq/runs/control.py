@@ -41,7 +41,7 @@ from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
 
-__all__ = ["CONTROL", "Run", "evaluate_run"]
+__all__ = ["CONTROL", "Run", "evaluate_run", "last_cap"]
 
 
 @dataclass(frozen=True)
@@ -153,13 +153,13 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
         try:
             stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
             with torch.no_grad():
-                most = config.evaluation_max_steps or _last_cap(run_dir)
+                most = config.evaluation_max_steps or last_cap(run_dir)
                 return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
         finally:
             envs.close()
 
 
-def _last_cap(run_dir: str | Path) -> int:
+def last_cap(run_dir: str | Path) -> int:
     """After how many steps the run's own evaluations were cut, where they learned that in training."""
     rows = read_rows(Path(run_dir) / "metrics.jsonl")
     caps = (row["max_steps"] for row in reversed(rows) if isinstance(row.get("max_steps"), int))

@@ -238,9 +238,9 @@ def _main(argv: Sequence[str] | None) -> int:
     if arguments[0] not in COMMANDS:
         return _top(arguments[0])
     module, function = COMMANDS[arguments[0]][:2]
+    asks = bool({"-h", "--help", "--print_config", "--print-config"} & set(arguments))  # and prints what it is told
     try:
-        as_json = "--json" in arguments and not {"--help", "-h"} & set(arguments)
-        with _present_folder(), warnings.catch_warnings(), _own_output(as_json):
+        with _present_folder(), warnings.catch_warnings(), _own_output("--json" in arguments and not asks):
             command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)
             warnings.showwarning = _show_warning
             return command(arguments[1:])

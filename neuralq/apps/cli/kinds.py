@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import signal
 import sys
@@ -20,8 +21,9 @@ __all__ = ["conclude", "measured_by", "new_budget", "resume_kind", "say", "train
 
 
 def say(line: str) -> None:
-    """A line beside the result, for whoever watches."""
-    print(f"neuralq: {line}", file=sys.stderr, flush=True)
+    """A line beside the result, for whoever watches; where the terminal has gone or the disk is full, for nobody."""
+    with contextlib.suppress(OSError):
+        print(f"neuralq: {line}", file=sys.stderr, flush=True)
 
 
 def conclude(run: Result, as_json: bool, notes: Sequence[str] = (), **more: Any) -> int:

@@ -17,7 +17,7 @@ from neuralq.apps.cli.film import caption, drawn, frame_rate, make_shown, pictur
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.apps.cli.sweeps import add_trust, single_run
 from neuralq.runs import RunConfig, load
-from neuralq.runs.evaluation import MOST_STEPS
+from neuralq.runs.control import last_cap
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.recipe.games import make_single, refusals_name
@@ -110,7 +110,7 @@ def _limit(options: argparse.Namespace, config: RunConfig) -> int:
         value = getattr(options, name)
         if value is not None and value < low:
             raise Failure(f"--{name.replace('_', '-')} must be a whole number of at least {low}, got {value}", 2)
-    limit: int = options.max_steps or config.evaluation_max_steps or MOST_STEPS
+    limit: int = options.max_steps or config.evaluation_max_steps or last_cap(options.run)
     return limit
 
 

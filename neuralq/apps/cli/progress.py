@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import time
@@ -89,18 +90,25 @@ class ProgressBar(Generic[T]):
         self._task = self._bar.add_task("", total=total, text="")
 
     def __enter__(self) -> ProgressBar[T]:
-        self._bar.start()
+        with contextlib.suppress(OSError):
+            self._bar.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
+        with contextlib.suppress(OSError):
+            self._bar.stop()
 
     def say(self, line: str, /) -> None:
         """A line above the bar."""
-        self._console.print(f"neuralq: {line}", highlight=False, soft_wrap=True, markup=False)
+        with contextlib.suppress(OSError):
+            self._console.print(f"neuralq: {line}", highlight=False, soft_wrap=True, markup=False)
 
     def __call__(self, report: T, /) -> None:
-        """Take in a report."""
+        """Take in a report; where the terminal has gone or the disk is full, what is told of it is lost and no more."""
+        with contextlib.suppress(OSError):
+            self._draw(report)
+
+    def _draw(self, report: T) -> None:
         told, now = self._tell(report), self._clock()
         narrow = self._console.width < _WIDE  # what is said last matters most, and is not to be what is left out
         parts = reversed(told.parts) if narrow else told.parts

@@ -32,6 +32,7 @@ from safetensors.torch import load as load_bytes
 from safetensors.torch import load_file, save_file
 
 from neuralq.checks import check_whole
+from neuralq.runs.folder.files import RunFolderError, open_regular, parse_json, read_regular
 
 __all__ = ["FORMAT_VERSION", "Checkpoint", "CheckpointError", "load", "load_newest", "save"]
 
@@ -314,7 +315,7 @@ def _sync(path: Path) -> None:
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
-    with open(path, "rb") as file:
+    with open(open_regular(path, os.O_RDONLY), "rb") as file:
         return {"bytes": os.fstat(file.fileno()).st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
@@ -332,9 +333,9 @@ def _signed(body: Mapping[str, Any]) -> bytes:
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        raw = (path / _MANIFEST).read_bytes()
-        manifest = json.loads(raw)
-    except (OSError, ValueError, RecursionError) as error:
+        raw = read_regular(path / _MANIFEST)
+        manifest = parse_json(raw)
+    except (OSError, ValueError, RunFolderError) as error:
         raise CheckpointError(f"{path} is no whole checkpoint: its {_MANIFEST} cannot be read ({error})") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT_NAME:
         raise CheckpointError(f"{path} was not written by neuralq: its {_MANIFEST} is of another format")
@@ -361,7 +362,7 @@ def _verified(path: Path) -> tuple[int, dict[str, Any]]:
             raise CheckpointError(f"{path} lists the file {name!r}, which is not a checkpoint's")
         try:
             got = _fingerprint(path / name)
-        except OSError as error:
+        except (OSError, RunFolderError) as error:
             raise CheckpointError(f"{path} is incomplete: {name} cannot be read ({error})") from error
         if got != expected:
             raise CheckpointError(f"{path} is damaged: {name} is not what was written (size or SHA-256 differs)")
