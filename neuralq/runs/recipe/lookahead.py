@@ -47,7 +47,7 @@ def warnings_ahead(config: RunConfig, stream: Interaction) -> list[str]:
         >>> import gymnasium as gym
         >>> from neuralq.runs.stream import make_vector_env
         >>> stream = Interaction(make_vector_env(lambda: gym.make("CartPole-v1"), 1), 0.9, 0)
-        >>> warnings_ahead(RunConfig(learner="replay", total_steps=900), stream)
+        >>> warnings_ahead(RunConfig(learner="replay", total_steps=900, epsilon_decay_steps=450), stream)
         ['nothing will be learned: the first update comes after 1,000 steps (--replay.learning-starts) of 900']
     """
     found = [_updates(config), _target(config), _exploration(config), _rate(config), *_unused_masks(stream)]
