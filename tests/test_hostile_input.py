@@ -57,10 +57,10 @@ def test_a_number_of_hundreds_of_digits_is_one_line(argv: list[str], capsys: Cap
     refusal(capsys, argv)
 
 
-def test_whole_numbers_have_64_bits() -> None:
-    check_whole("seed", 2**63 - 1)
+def test_whole_numbers_have_128_bits() -> None:
+    check_whole("seed", 2**128 - 1)
     check_whole("seed", np.int64(2**63 - 1))  # type: ignore[arg-type]
-    for value in (2**63, -(2**63), 10**400):
+    for value in (2**128, -(2**128), 10**400):
         with pytest.raises(ValueError, match="below 2"):
             check_whole("seed", value)
     assert fitted_value("x", 10**20, int) == 10**20 and fitted_value("x", 10**20, float) == 1e20

@@ -47,6 +47,17 @@ class Plain(gym.Env[Any, Any]):
 gym.register("ahead/Plain-v0", Plain)
 
 
+class Numbered(Plain):
+    """Many states."""
+
+    def __init__(self, states: int) -> None:
+        super().__init__()
+        self.observation_space = spaces.Discrete(states)  # type: ignore[assignment]
+
+    def look(self) -> tuple[Any, dict[str, Any]]:
+        return 0, {}
+
+
 def ahead(config: RunConfig, **kwargs: Any) -> list[str]:
     return warnings_ahead(config, Interaction(make_vector_env(lambda: Plain(**kwargs), 1), 0.9, 0))
 
@@ -154,12 +165,10 @@ def spec_of(states: int | None, actions: int) -> ObservationSpec:
         ("linear", 10**6, 100, 10**8, "give each state"),
     ],
 )
-def test_what_does_not_fit_is_refused_before_it_is_made(
+def test_weights_that_do_not_fit_are_refused_before_they_are_made(
     layout: str, states: int, actions: int, weights: int, way_out: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, spec = RunConfig(layout=layout), spec_of(states, actions)
-    monkeypatch.setattr(checks, "available_bytes", lambda: 28 * weights)
-    require_room(config, spec)
     monkeypatch.setattr(checks, "available_bytes", lambda: 28 * weights - 1)
     with pytest.raises(MemoryError, match=f"{weights:,} weights.*GiB.*{way_out}"):
         require_room(config, spec)
@@ -168,13 +177,23 @@ def test_what_does_not_fit_is_refused_before_it_is_made(
 def test_very_many_actions_one_at_a_time_are_refused_or_their_time_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     config = RunConfig(layout="action-input", total_steps=100_000)
     found = ahead(config, actions=10_000)
-    # 10,000 passes of 10,002 + 10,000 inputs, 128 and 128 units, for one state to act in and four to learn from, a
-    # multiplication and an addition each: 10⁴ · 2 · 2.58e6 · 5 = 2.6e11, at 1e10 a second 26 s.
-    assert len(found) == 1 and "about 26 s per step" in found[0] and "--layout action-output" in found[0]
+    # 10,000 passes of 10,002 + 10,000 inputs, 128 and 128 units (2,576,768 weights), a multiplication and an addition
+    # each, once to act and three times for each of four passes to learn: 10⁴ · 2 · 2.58e6 · 13 = 6.7e11.
+    assert len(found) == 1 and "about 68 s per step" in found[0] and "--layout action-output" in found[0]
     assert ahead(config, actions=18) == []
     monkeypatch.setattr(checks, "available_bytes", lambda: 2**32)
-    with pytest.raises(MemoryError, match=r"the values of 10,000 actions in 32 states.*--layout action-output"):
+    with pytest.raises(MemoryError, match=r"what is computed of 1,024 observations at once.*--layout action-output"):
         require_room(config, spec_of(4, 10_000))
+
+
+def test_very_many_states_as_one_hot_vectors_are_told_to_be_slow_and_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Interaction(make_vector_env(lambda: Numbered(10**6), 1), 0.9, 0)
+    for layout in ("action-output", "linear"):
+        assert "s per step" in warnings_ahead(RunConfig(layout=layout), stream)[0]
+    assert warnings_ahead(RunConfig(layout="table"), stream) == []
+    monkeypatch.setattr(checks, "available_bytes", lambda: 10**10)
+    with pytest.raises(MemoryError, match="give each state a few numbers of its own"):  # 1,024 rows of 3 · 4 MB
+        require_room(RunConfig(layout="linear"), stream.spec)
 
 
 def test_a_network_that_does_not_fit_is_one_line_at_the_command(

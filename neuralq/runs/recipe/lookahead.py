@@ -21,7 +21,7 @@ __all__ = ["num_updates", "require_room", "warnings_ahead"]
 
 _BYTES_PER_WEIGHT = 28  # drawn in float64; then parameters, gradient, two moments and a target in float32
 _FLOPS_PER_SECOND = 1e10  # of one core; a product of matrices does several times as much
-_LONG_HOURS = 12.0
+_LONG_SECONDS = 0.01
 
 
 def num_updates(config: RunConfig) -> int:
@@ -47,7 +47,7 @@ def warnings_ahead(config: RunConfig, stream: Interaction) -> list[str]:
         >>> import gymnasium as gym
         >>> from neuralq.runs.stream import make_vector_env
         >>> stream = Interaction(make_vector_env(lambda: gym.make("CartPole-v1"), 1), 0.9, 0)
-        >>> warnings_ahead(RunConfig(learner="replay", total_steps=900, epsilon_decay_steps=500), stream)
+        >>> warnings_ahead(RunConfig(learner="replay", total_steps=900, epsilon_decay_steps=450), stream)
         ['nothing will be learned: the first update comes after 1,000 steps (--replay.learning-starts) of 900']
     """
     found = [_updates(config), _target(config), _exploration(config), _rate(config), *_unused_masks(stream)]
@@ -110,16 +110,23 @@ def _unused_masks(stream: Interaction) -> Iterator[str]:
 
 
 def _long(config: RunConfig, spec: ObservationSpec) -> Iterator[str]:
-    """Where a network that sees one action at a time is asked about very many."""
+    """Where the network is passed for so many inputs, outputs or actions that a step takes a noticeable time."""
     weights = _num_weights(config, spec)
-    if config.layout != "action-input" or weights is None:
+    if weights is None or config.layout == "table":
         return
-    per_step = 2 * weights * spec.num_actions * (1 + _rows_per_step(config)) / _FLOPS_PER_SECOND
-    hours = per_step * config.total_steps / 3600
-    if hours > _LONG_HOURS:
+    settings: Any = config.settings
+    passes = spec.num_actions if config.layout == "action-input" else 1
+    # Forwards to act; forwards and twice as much backwards to learn; and the optimiser, ten operations per weight.
+    per_row = (2 * weights + 8 * _num_inputs(spec)) * passes
+    rows = _rows_per_step(config)
+    operations = per_row * (1 + 3 * rows) + 10 * weights * rows / max(1, getattr(settings, "batch_size", 64))
+    per_step = operations / _FLOPS_PER_SECOND
+    if per_step > _LONG_SECONDS:
+        hours = per_step * config.total_steps / 3600
+        once = f"is passed once for each of {passes:,} actions" if passes > 1 else f"has {weights:,} weights"
         yield (
-            f"an action-input network is passed once for each of {spec.num_actions:,} actions: about {per_step:.2g} s "
-            f"per step, {hours:,.0f} hours for {config.total_steps:,} steps; --layout action-output passes it once"
+            f"the {config.layout} representation {once}: about {per_step:.2g} s per step, {hours:,.1f} hours for "
+            f"{config.total_steps:,} steps; {_way_out(config, spec)}"
         )
 
 
@@ -131,9 +138,23 @@ def _rows_per_step(config: RunConfig) -> float:
     return float(getattr(settings, "num_epochs", 1))
 
 
+def _num_inputs(spec: ObservationSpec) -> int:
+    return int(np.prod(spec.inner_shape)) if spec.num_categories is None else spec.num_categories
+
+
+def _way_out(config: RunConfig, spec: ObservationSpec) -> str:
+    if config.layout == "table":
+        return "merge states, or take a function of them: --layout action-output"
+    if spec.num_categories is not None and spec.num_categories > spec.num_actions:
+        return "give each state a few numbers of its own (gymnasium.wrappers.TransformObservation), or --layout table"
+    if config.layout == "action-input":
+        return "--layout action-output passes all of them at once"
+    return "take narrower layers (--hidden 64,64), --layout action-output or linear, or fewer actions"
+
+
 def _num_weights(config: RunConfig, spec: ObservationSpec) -> int | None:
     """Of a table, a linear function or an MLP; None for bodies whose size is not plain from the configuration."""
-    inputs = int(np.prod(spec.inner_shape)) if spec.num_categories is None else spec.num_categories
+    inputs = _num_inputs(spec)
     outputs = spec.num_actions * config.kind.outputs(config.settings, config.layout)
     if config.layout in ("table", "linear"):
         return inputs * outputs
@@ -158,23 +179,27 @@ def require_room(config: RunConfig, spec: ObservationSpec) -> None:
     if weights is None:
         return
     states = "observations" if spec.num_categories is None else f"{spec.num_categories:,} states"
-    if config.layout == "table":
-        way_out = "merge states, or take a function of them: --layout action-output"
-    elif spec.num_categories is not None and spec.num_categories > spec.num_actions:
-        way_out = (
-            "give each state a few numbers of its own (gymnasium.wrappers.TransformObservation), or --layout table"
-        )
-    else:
-        way_out = "take narrower layers (--hidden 64,64), --layout action-output or linear, or fewer actions"
     what = f"the {config.layout} representation of {states} and {spec.num_actions:,} actions ({weights:,} weights)"
-    check_fits(what, _BYTES_PER_WEIGHT * weights, way_out)
+    check_fits(what, _BYTES_PER_WEIGHT * weights, _way_out(config, spec))
+    if config.layout != "table":
+        rows, per_row = _rows_at_once(config), _bytes_per_row(config, spec)
+        check_fits(f"what is computed of {rows:,} observations at once", rows * per_row, _way_out(config, spec))
+
+
+def _rows_at_once(config: RunConfig) -> int:
+    """States whose values are computed together."""
+    settings: Any = config.settings
+    num_envs = getattr(settings, "num_envs", 1)
+    if config.kind.experience == "rollouts":
+        return int(num_envs * settings.num_steps)
+    return int(max(num_envs, getattr(settings, "batch_size", 1)))
+
+
+def _bytes_per_row(config: RunConfig, spec: ObservationSpec) -> int:
+    """Inputs with their copies, units with what is kept for the gradient, and outputs, in float32."""
+    hidden = () if config.layout == "linear" else (config.body or MLP()).hidden
     if config.layout == "action-input":
-        settings: Any = config.settings
-        rows = max(getattr(settings, "num_envs", 1), getattr(settings, "batch_size", 1))
-        width = int(np.prod(spec.inner_shape)) if spec.num_categories is None else spec.num_categories
-        body = config.body or MLP()
-        per_pass = width + spec.num_actions + 3 * sum(body.hidden)
-        check_fits(
-            f"the values of {spec.num_actions:,} actions in {rows:,} states, each with an input of its own",
-            4 * rows * spec.num_actions * per_pass, "take --layout action-output, which has one input for all of them",
-        )  # fmt: skip
+        return 4 * spec.num_actions * (_num_inputs(spec) + spec.num_actions + 3 * sum(hidden))
+    outputs = spec.num_actions * config.kind.outputs(config.settings, config.layout)
+    copies = spec.num_actions if config.layout == "separate" else 1
+    return 4 * (3 * _num_inputs(spec) + 3 * copies * sum(hidden) + 2 * outputs)
