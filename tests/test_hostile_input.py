@@ -86,7 +86,7 @@ def test_yaml_that_others_would_cut_or_never_finish_is_refused(tmp_path: Path, c
         read_yaml("[1")
     for name, text in (
         ("twice.yaml", "gamma: 0.9\ngamma: 0.8\n"), ("twice.json", '{"gamma": 0.9, "gamma": 0.8}'),
-        ("deep.json", "[" * 100_000), ("bomb.yaml", BOMB), ("list.yaml", "- 1"),
+        ("deep.json", "[" * 5_000), ("bomb.yaml", BOMB), ("list.yaml", "- 1"),
     ):  # fmt: skip
         (tmp_path / name).write_text(text)
         assert name in refusal(capsys, ["train", "CartPole-v1", "--config", str(tmp_path / name)])
