@@ -44,7 +44,9 @@ def test_gamma_of_w_to_2w(epsilon: float) -> None:
 def test_two_boundaries_are_both_found() -> None:
     # With one weight, 1 − α(A + η) leaves (−1, 1) at η = −A and at η = 2/α − A.
     problem, alpha = two_states((1, 2)), 0.5  # A = −0.2 at γ = .9
-    assert scan(problem, "eta", step_size=alpha).boundaries == pytest.approx((0.2, 2 / alpha + 0.2), rel=1e-9)
+    found = scan(problem, "eta", step_size=alpha)
+    assert found.boundaries == pytest.approx((0.2, 2 / alpha + 0.2), rel=1e-9)
+    assert found.first() == pytest.approx(0.2, rel=1e-9)
 
 
 def test_a_narrow_window_between_two_points_is_found() -> None:

@@ -136,6 +136,13 @@ def test_the_munchausen_target_is_its_definition(masked: bool) -> None:
         assert float(got) == pytest.approx(munchausen_by_definition(r, gamma, q, a, q_next, tau, alpha, floor))
 
 
+def test_munchausen_is_published_with_a_temperature_of_3_percent_a_weight_of_90_and_a_floor_of_1() -> None:
+    q, q_next = [0.5, 0.47, 0.1], [0.2, 0.21, -1.0]  # actions 0 and 1 are near each other, 2 is below the floor
+    for a in range(3):
+        got = rules.munchausen(column(1)[0], column(0.9)[0], column(*q), torch.tensor(a), column(*q_next))
+        assert float(got) == pytest.approx(munchausen_by_definition(1, 0.9, q, a, q_next, 0.03, 0.9, -1.0))
+
+
 def test_at_small_temperatures_munchausen_is_advantage_learning() -> None:
     # τ → 0: r + α (q[a] − max q) + γ max q'; here 1 + 0.9 · (1 − 1.5) + 0.5 · 4, nothing clipped.
     zero = torch.zeros((), dtype=F64)

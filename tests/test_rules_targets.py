@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from neuralq import rules
+from neuralq.rules import TargetRule
+from neuralq.rules.target_rule import Followed, Seen
+from neuralq.types import Transition
 
 INF = torch.inf
 Q_T = torch.tensor([[1.0, 4.0, 2.0], [-1.0, -3.0, -INF], [-INF, -INF, -INF]])
@@ -116,3 +119,16 @@ def test_mismatched_shapes_are_refused() -> None:
     ]:
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_a_rule_that_follows_an_action_takes_its_value_whatever_the_axes() -> None:
+    q_t = torch.tensor([[[1.0, 5.0], [7.0, 2.0]], [[3.0, 4.0], [9.0, 8.0]]], dtype=torch.float64)  # [T, N, A]
+    a = torch.tensor([[1, 0], [0, 1]])
+    ones = torch.ones(2, 2)
+    step = Transition(0 * a, 0 * a, ones, ones, 0.5 * ones, 0 * a, ones < 0)
+    rule = TargetRule("given", "what is given", "this test", follows=lambda seen: Followed(a=a))
+    target = rule.target(Seen(step, lambda s, frozen: q_t))
+    assert target.tolist() == [[1 + 2.5, 1 + 3.5], [1 + 1.5, 1 + 4.0]]
+    flat = Transition(*(x.reshape(-1) for x in (0 * a, 0 * a, ones, ones, 0.5 * ones, 0 * a, ones < 0)))
+    rule = TargetRule("given", "what is given", "this test", follows=lambda seen: Followed(a=a.reshape(-1)))
+    assert rule.target(Seen(flat, lambda s, frozen: q_t.reshape(4, 2))).tolist() == target.reshape(-1).tolist()
