@@ -30,7 +30,7 @@ def input_names(agent: Agent) -> list[str]:
         >>> space = spaces.Dict({"arm": spaces.Tuple([spaces.Box(-1, 1, (2,))]), "gear": spaces.Discrete(3)})
         >>> spec = type("Spec", (), {"masked": True})
         >>> input_names(Agent(None, encoder_for(space), spec))
-        ['gear', 'arm.0', 'action_mask']
+        ['arm.0', 'gear', 'action_mask']
     """
     names = [".".join(map(str, part.keys)) or "observation" for part in agent.encoder.parts]
     if agent.spec.masked:
