@@ -188,12 +188,8 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
 
 
 _CHANGEABLE = frozenset(
-    (
-        *"stop_at_return evaluate_every evaluation_episodes evaluation_max_steps".split(),
-        "checkpoint_every",
-        "log_every",
-        "resume_probe",
-    )
+    "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
+    "resume_probe".split()
 )
 CONTROL = Kind(
     name="control",

@@ -15,8 +15,8 @@ from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
-from neuralq.runs.control import CONTROL
-from neuralq.runs.evaluation import MOST_STEPS, shown
+from neuralq.runs.control import CONTROL, last_cap
+from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
@@ -188,7 +188,7 @@ def _cut(run: Run) -> str | None:
     rows = [row for row in read_metrics(run.run_dir) if row.get("kind") == "evaluation"]
     if not rows or not rows[-1].get("num_cut"):
         return None
-    most = rows[-1].get("max_steps") or read_config(run.run_dir).get("evaluation_max_steps") or MOST_STEPS
+    most = read_config(run.run_dir).get("evaluation_max_steps") or last_cap(run.run_dir)
     return (
         f"{rows[-1]['num_cut']} of {len(rows[-1]['returns'])} evaluation episodes were cut off after {most:,} steps: "
         "the environment did not end them (--evaluation-max-steps sets how many)"

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import gymnasium as gym
 
 from neuralq.runs.stream.encoding import ObservationError
-from neuralq.runs.stream.vector_env import SubEnvFault
+from neuralq.runs.stream.vector_env import SubEnvFault, what_it_did
 
 __all__ = ["EnvironmentFault", "describe_error", "faults_of"]
 
@@ -32,13 +32,11 @@ def faults_of(doing: str) -> Iterator[None]:
     except gym.error.DependencyNotInstalled:  # for which there is a way out
         raise
     except Exception as error:
-        raise EnvironmentFault(f"{doing}, the environment raised {type(error).__name__}: {error}") from error
+        raise EnvironmentFault(f"{doing}, the environment {what_it_did(error)}") from error
 
 
 def describe_error(error: BaseException) -> str:
     """What an environment raised."""
     if isinstance(error, SubEnvFault | ObservationError):
         return str(error)
-    if isinstance(error, SystemExit):
-        return f"an environment called sys.exit({'' if error.code is None else repr(error.code)})"
-    return f"an environment raised {type(error).__name__}: {error}"
+    return f"an environment {what_it_did(error)}"

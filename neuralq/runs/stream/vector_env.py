@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from neuralq.checks import check_whole
 from neuralq.runs.stream.encoding import encoder_for
 
-__all__ = ["MASK_METHODS", "SubEnv", "SubEnvFault", "legal_actions", "make_vector_env"]
+__all__ = ["MASK_METHODS", "SubEnv", "SubEnvFault", "legal_actions", "make_vector_env", "what_it_did"]
 
 MASK_METHODS = ("action_masks", "valid_action_mask")
 """Methods by which environments tell their legal actions, for those that do not put them into info."""
@@ -57,6 +57,18 @@ class SubEnvFault(RuntimeError):
     def __init__(self, index: int, problem: str) -> None:
         super().__init__(f"environment {index}{problem}")
         self.index = index
+
+
+def what_it_did(error: BaseException) -> str:
+    """What somebody's code did that ended with this error.
+
+    Example:
+        >>> what_it_did(KeyError("speed")), what_it_did(SystemExit(3))
+        ("raised KeyError: 'speed'", 'called sys.exit(3)')
+    """
+    if isinstance(error, SystemExit):
+        return f"called sys.exit({'' if error.code is None else repr(error.code)})"
+    return f"raised {type(error).__name__}: {error}"
 
 
 class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -119,10 +131,8 @@ class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
             return bool(found.reshape(-1)[0])
         raise SubEnvFault(self.index, f": {field} must be true or false, got {value!r}")
 
-    def _raised(self, error: Exception | SystemExit) -> SubEnvFault:
-        if isinstance(error, SystemExit):
-            return SubEnvFault(self.index, f" called sys.exit({'' if error.code is None else repr(error.code)})")
-        return SubEnvFault(self.index, f" raised {type(error).__name__}: {error}")
+    def _raised(self, error: BaseException) -> SubEnvFault:
+        return SubEnvFault(self.index, f" {what_it_did(error)}")
 
     def _checked(self, observation: Any) -> Any:
         """A copy; the quick way first, for arrays and numbers of exactly the promised kind."""
