@@ -82,12 +82,15 @@ def _passed_on(run: Any) -> Any:
     return run
 
 
-def load(run_dir: str | Path, best: bool = False) -> Any:
-    """The agent of a run's newest checkpoint, or of its best evaluation.
+def load(run_dir: str | Path, best: bool | None = None) -> Any:
+    """The agent of a run: its last parameters, or its best where those are what the run ended with.
+
+    A run that ends below its best evaluation plays both on fresh episodes and keeps the last, unless the best is better
+    by more than the standard error of the difference.
 
     Args:
         run_dir: folder of the run.
-        best: the parameters whose greedy evaluation scored highest, in place of the newest.
+        best: True for the parameters whose greedy evaluation scored highest, False for the last.
 
     Returns:
         A `neuralq.runs.agent.Agent`; of a TD-Gammon run a `neuralq.systems.backgammon.BackgammonAgent`.
