@@ -141,7 +141,8 @@ class SessionView:
         step = self._watch.watchable("steps").last_step
         if step is None:
             return None
-        rows: list[Any] = [_read_only(row) for row in (*step.rows, step.env_indices)]
+        s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t = map(_read_only, step.rows)
+        rows = (s_tm1, a_tm1, mu_tm1, r_t, discount_t, s_t, last_t, _read_only(step.env_indices))
         return StepArrays(*rows, step.episodes)
 
     @property
@@ -177,7 +178,7 @@ class SessionView:
         Args:
             why: told with the result, after the name of the hook.
         """
-        if not why or not isinstance(why, str):  # type: ignore[redundant-expr]  # whatever a hook passes
+        if not why or not isinstance(why, str):
             raise ValueError(f"say in words why the run is to stop, got {why!r}; session.stop('no better for 5 looks')")
         self._watch.stop(why)
 
