@@ -21,7 +21,7 @@ def train(config: RunConfig, run_dir: str | Path | None = None, hooks: Sequence[
     Args:
         config: what to run.
         run_dir: folder for the run; by default one under ``runs/``, named after environment, layout, seed and time.
-        hooks: called with every row of metrics.
+        hooks: called with every row of metrics, and shown the session where they ask for it (docs/hooks.md).
 
     Raises:
         ValueError: for environments and settings that do not go together.
@@ -52,7 +52,7 @@ def resume(run_dir: str | Path, total_steps: int | None = None, hooks: Sequence[
         run_dir: folder of the run.
         total_steps: a new budget, which becomes part of the run's configuration; a finished run goes on only with a
             larger one.
-        hooks: called with every row of metrics.
+        hooks: called with every row of metrics, and shown the session where they ask for it (docs/hooks.md).
         changes: other settings that do not decide what is learned, which become part of the configuration, too:
             ``device="cpu"``, ``stop_at_return=None``, ``evaluate_every=10_000``, ….
 

@@ -7,6 +7,7 @@ import contextlib
 import contextvars
 import difflib
 import importlib
+import importlib.util
 import itertools
 import json
 import re
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple, TextIO
 
 from neuralq.apps.cli.numbers import joined, number, whole_number
 from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
+from neuralq.checks import ELSEWHERE
 
 __all__ = [
     "COMMANDS",
@@ -246,6 +248,9 @@ def _main(argv: Sequence[str] | None) -> int:
         return 2
     if arguments[0] not in COMMANDS:
         return _top(arguments[0])
+    if importlib.util.find_spec("fcntl") is None:
+        print(f"neuralq: {ELSEWHERE}", file=sys.stderr)
+        return 1
     module, function = COMMANDS[arguments[0]][:2]
     asks = bool({"-h", "--help", "--print-config", "--print_config"} & set(arguments))  # and prints what it is told
     try:
