@@ -143,8 +143,8 @@ def own_maker(env: str) -> Callable[..., Any] | None:
     """The class or function that "module:name" names; None where that is a registered id.
 
     Example:
-        >>> own_maker("neuralq_envs.grids:MitchellGridEnv").__name__, own_maker("CartPole-v1")
-        ('MitchellGridEnv', None)
+        >>> own_maker("gymnasium.envs.classic_control:CartPoleEnv").__name__, own_maker("CartPole-v1")
+        ('CartPoleEnv', None)
     """
     module, _, name = env.rpartition(":")
     if not module:

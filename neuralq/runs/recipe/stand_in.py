@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-__all__ = ["Maker", "nameless", "stand_in", "standing_in"]
+__all__ = ["nameless", "stand_in", "standing_in"]
 
 Maker = Callable[[], gym.Env[Any, Any]]
 
