@@ -37,7 +37,7 @@ def train(
         env: a Gymnasium id, or "module:id"; an environment, or a class or function that makes one; a mapping of
             settings with one of these as ``env``; or a whole `RunConfig`. An environment is copied and not touched.
         run_dir: folder for the run; by default one under ``runs/``, named after environment, layout, seed and time.
-        hooks: called with every row of metrics.
+        hooks: called with every row of metrics, and shown the session where they ask for it (docs/hooks.md).
         preset: whether to start from the preset.
         settings: fields of `RunConfig`; settings of the learner by their own names (``lambda_=0.8``); and ``hidden``,
             ``layer_norm`` and ``activation`` of the network.
@@ -121,7 +121,7 @@ def resume(
         run_dir: folder of the run, or the run itself.
         total_steps: a new budget, which becomes part of the run's configuration; a finished run goes on only with a
             larger one.
-        hooks: called with every row of metrics.
+        hooks: called with every row of metrics, and shown the session where they ask for it (docs/hooks.md).
         env: the environment, as `train` takes it, of a run in whose folder it has no name that could be followed.
         changes: other settings that do not decide what is learned, which become part of the configuration, too:
             ``device="cpu"``, ``stop_at_return=None``, ``evaluate_every=10_000``, ….
