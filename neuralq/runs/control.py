@@ -30,12 +30,11 @@ from neuralq.runs.recipe.build import (
     build_q,
     build_session,
     engine_name,
-    make_envs,
-    make_evaluation_envs,
     normalisation_for,
     plan_of,
 )
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session

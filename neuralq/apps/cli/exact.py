@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.apps.pages.grids import short
 from neuralq.apps.pages.page import Arrow, ChapterPage, GridDrawing, Square
 from neuralq.apps.pages.svg import page_svg
@@ -86,31 +86,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--max-iterations", type=int, metavar="N", help="stop after so many (default: when it is solved)"
     )
-    parser.add_argument(
-        "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
-    )
+    parser.add_argument("--env-kwargs", type=reader(dict), default={}, metavar="MAPPING", help=ENV_KWARGS)
     parser.add_argument(
         "--no-check",
         action="store_true",
         help="take the table as it stands; else a few thousand steps of the environment are compared with it first",
     )
-    parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
+    parser.add_argument("--svg", metavar="FILE", help="also draw the grid to this SVG file")
     return parser
 
 
 def _finite(value: float) -> float | None:
     """JSON knows no infinity: a bound that is not known is null."""
     return value if np.isfinite(value) else None
-
-
-def _json_object(text: str) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"must be a JSON object such as '{{\"is_slippery\": false}}', got {text!r}")
-    return value
 
 
 def _model(env_id: str, kwargs: dict[str, Any], *, check: bool) -> tuple[FiniteMDP, GridPlan | None, int | None]:

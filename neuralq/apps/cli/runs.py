@@ -11,6 +11,7 @@ from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
@@ -100,7 +101,7 @@ def target(text: str) -> float | None:
         >>> target("475"), target("none")
         (475.0, None)
     """
-    return None if text.lower() in ("none", "null") else float(text)
+    return None if text.lower() in ("none", "null") else number(text)
 
 
 @contextlib.contextmanager
