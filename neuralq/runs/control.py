@@ -40,6 +40,7 @@ from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.runs.watchers import monitor_verdict, watchers
 
 __all__ = ["CONTROL", "Run", "agent_of", "evaluate_run", "last_cap"]
 
@@ -64,6 +65,7 @@ class Run:
         play_off: of a run that ended below its best evaluation, what that was decided by
             (`neuralq.runs.evaluation.play_off`); else None.
         exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
+        monitor: what the monitor of divergence says (`neuralq.lab.DivergenceMonitor.verdict`); None without it.
     """
 
     run_dir: Path
@@ -80,6 +82,7 @@ class Run:
     agent: str = "final"
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
+    monitor: dict[str, Any] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -98,7 +101,11 @@ class Run:
         ]
         if self.play_off is not None:
             lines.append(_about_play_off(self.play_off))
-        return lines if self.exact is None else [*lines, *Comparison(**self.exact).lines()]
+        if self.exact is not None:
+            lines += Comparison(**self.exact).lines()
+        if self.monitor is not None and self.monitor["alarms"]:
+            lines.append(f"it may have diverged ({', '.join(self.monitor['alarms'])}): {self.monitor['seen']}")
+        return lines
 
 
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
@@ -120,6 +127,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         agent=agent,
         play_off=play_off,
         exact=exact,
+        monitor=monitor_verdict(progress.hook_states),
     )
 
 
@@ -128,7 +136,7 @@ def _about_play_off(found: Mapping[str, Any]) -> str:
     which = (
         "the best are the run's agent, --final takes the last"
         if found["agent"] == "best"
-        else "the last are the run's agent, for the difference may be chance; --best takes the others"
+        else "the last are the run's agent, for the best are not better beyond chance; --best takes them"
     )
     return (
         f"it ended below its best evaluation, at {found['best_env_steps']:,} steps; over {found['num_episodes']} fresh "
@@ -256,6 +264,8 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
             notes.append(f"{label} {latest[name]:.3g}")
     if "episode_return" in latest:
         notes.append(f"return {shown(latest['episode_return'])}")
+    if "alarm" in latest:
+        notes.append(f"may diverge: {latest['alarm']}")
     if "q_error_mean" in latest:
         notes.append(f"|Q − Q*| {latest['q_error_mean']:.3g}, regret {latest['regret']:.3g}")
     if "greedy_return" in latest:
@@ -286,4 +296,5 @@ CONTROL = Kind(
     notes=_notes,
     changeable=_CHANGEABLE,
     opening=_opening,
+    watchers=watchers,
 )

@@ -99,6 +99,7 @@ class Kind(Generic[C, T, R]):
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
         changeable: fields that do not decide what is learned: a run may go on with other values.
         command: what the command line has to know to train by options of the kind's own.
+        watchers: of a configuration and the hooks that were given, what else watches a run, before them.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Kind(Generic[C, T, R]):
     changeable: frozenset[str] = frozenset()
     command: CommandLine | None = None
     opening: Callable[[C, T], list[str]] | None = None
+    watchers: Callable[[C, Sequence[Hook]], list[Hook]] | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
@@ -201,7 +203,8 @@ class Kind(Generic[C, T, R]):
                 say_to(hooks, line)
             if isinstance(trainee, Speaks):
                 trainee.say = functools.partial(say_to, hooks)
-            fit(trainee, plan, progress, folder, hooks, config)
+            watching = [] if self.watchers is None else self.watchers(config, hooks)
+            fit(trainee, plan, progress, folder, [*watching, *hooks], config)
         else:
             warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)
