@@ -1,0 +1,229 @@
+"""A Gymnasium environment walked by a tabular learner: one step of it, one call of a kernel.
+
+Everything here is paid at every step, and a step of a small environment takes 8 µs: so the kernels are called without
+looking at their types, what stands in the walk's counters is kept in local names until the walk pauses, and what an
+environment hands out is looked at by its type first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
+
+from neuralq.jit import specialised
+from neuralq.tabular.kernels.acting import (
+    ACTION,
+    EPISODE_STEPS,
+    EPISODES,
+    LIMIT,
+    REPLAY,
+    STATE,
+    STEP,
+    Log,
+    Walk,
+    choose,
+    new_log,
+)
+from neuralq.tabular.learner import Learner
+from neuralq.tabular.model import empty_arrays
+
+__all__ = ["EnvironmentWalk", "Episode", "WalkFault", "state_reader"]
+
+Episode = tuple[float, int]
+"""Undiscounted return and length of an episode that has ended."""
+
+_FLAGS = (bool, np.bool_)
+
+
+class WalkFault(RuntimeError):
+    """An environment raised, or handed out what its spaces did not promise; says in which field."""
+
+
+def state_reader(space: Discrete) -> Callable[[Any], int]:
+    """What makes states 0, 1, … of a `Discrete` space's observations, and refuses what is none of them.
+
+    Example:
+        >>> state_reader(Discrete(3, start=5))(6)
+        1
+    """
+    first, num_states = int(space.start), int(space.n)
+
+    def read(observation: Any) -> int:
+        try:
+            whole = int(observation)
+            s = whole - first if whole == observation else -1
+        except (TypeError, ValueError, OverflowError):
+            s = -1
+        if not 0 <= s < num_states:
+            raise WalkFault(f"observation must lie in {first}..{first + num_states - 1}, got {observation!r}")
+        return s
+
+    return read
+
+
+class EnvironmentWalk:
+    """One environment, a learner that acts in it, and where they are.
+
+    Args:
+        env: with Discrete actions.
+        read: observations to states 0, 1, …; raises `WalkFault` for what is none.
+        learner: what learns and acts.
+        walk: where the agent is; its counters hold while `run` is not running.
+        seed: of the first reset; None if the environment stands within an episode already.
+        remembered: how many of the last transitions are kept in `recent`.
+        mask_of: the legal actions ``[A]`` of where the environment stands, of its info; None where it tells none.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        read: Callable[[Any], int],
+        learner: Learner,
+        walk: Walk,
+        seed: int | None,
+        remembered: int = 1,
+        mask_of: Callable[[dict[str, Any]], Any] = lambda extras: extras.get("action_mask"),
+    ) -> None:
+        self._env, self._read, self._learner, self._walk = env, read, learner, walk
+        self._first_action = int(env.action_space.start)  # type: ignore[attr-defined]
+        self._seed, self._mask_of = seed, mask_of
+        self.masks: list[bytes | None] = [None] * len(learner.acting_table.q)
+        self.running_return = 0.0
+        self.recent = new_log(remembered, REPLAY)
+        self._nothing = empty_arrays()
+        self._codes: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+
+    def _compiled(self, gamma: float) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """The learner's loop and its choice of an action."""
+        if self._codes is None:
+            learner = self._learner
+            like = (self._nothing, learner.policy, learner.table, self._walk, self.recent, *learner.arguments, gamma, 1)
+            acts = (learner.acting_table, np.uint64(0), 0, learner.policy, self._walk.rng)
+            self._codes = specialised(learner.loop, *like), specialised(choose, *acts)
+        return self._codes
+
+    def run(self, gamma: float, num_steps: int, log: Log | None = None) -> list[Episode]:
+        """Take ``num_steps`` steps, learn from each, and say which episodes ended.
+
+        Args:
+            gamma: γ.
+            num_steps: how many; none compiles what is called.
+            log: where the transitions are recorded as well, from its offset on.
+
+        Raises:
+            WalkFault: the environment's fault. The walk is over then.
+            ValueError: the learner cannot learn from what came.
+        """
+        learn, choose_in = self._compiled(float(gamma))
+        learner, walk, recent = self._learner, self._walk, self.recent
+        counters, rng, policy, acting = walk.counters, walk.rng, learner.policy, learner.acting_table
+        s_tm1, a_tm1, r, discount, reached, a_next, ends = recent[2:]
+        before, after = (self._nothing, policy, learner.table, walk), (*learner.arguments, float(gamma), 1)
+        rows = [recent._replace(offset=row) for row in range(len(r))]
+        first, limit = self._first_action, int(counters[LIMIT]) or 1 << 62
+        on_policy, single, step_of, recording = learner.on_policy, learner.acts_in is not None, self._env.step, log is not None
+        s, a, length = int(counters[STATE]), int(counters[ACTION]), int(counters[EPISODE_STEPS])
+        step, total, episodes = int(counters[STEP]), self.running_return, []
+        for i in range(num_steps):
+            if s < 0:
+                s, length, total = self._begin(), 0, 0.0
+            if a < 0:
+                a = choose_in(acting, s, step, policy, rng)
+            try:
+                observation, reward, terminated, truncated, extras = step_of(a + first)
+            except (Exception, SystemExit) as error:
+                raise WalkFault("step") from error
+            if type(reward) is not float or not math.isfinite(reward):
+                reward = _reward(reward)
+            if type(terminated) not in _FLAGS or type(truncated) not in _FLAGS:
+                terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
+            s_t = self._arrive(observation, extras, terminated)
+            length += 1
+            total += reward
+            last = terminated or truncated or length >= limit
+            a_t = choose_in(acting, s_t, step + 1, policy, rng) if on_policy and not terminated else -1
+            k = step % len(rows)
+            s_tm1[k], a_tm1[k], r[k], discount[k] = s, 0 if single else a, reward, 0.0 if terminated else gamma
+            reached[k], a_next[k], ends[k] = s_t, a_t, last
+            if recording:
+                _record(log, i, (s, a, reward, 0.0 if terminated else gamma, s_t, a_t, last))
+            learn(*before, rows[k], *after)
+            step += 1
+            s, a = s_t, a_t
+            if last:
+                episodes.append((total, length))
+                s, a, length, total = -1, -1, 0, 0.0
+        counters[STATE], counters[ACTION], counters[EPISODE_STEPS] = s, a, length
+        counters[EPISODES] += len(episodes)
+        self.running_return = total
+        if learner.check is not None:
+            learner.check()
+        return episodes
+
+    def _begin(self) -> int:
+        """The first state of an episode."""
+        try:
+            observation, extras = self._env.reset(seed=self._seed)
+        except (Exception, SystemExit) as error:
+            raise WalkFault("reset") from error
+        self._seed = None
+        return self._arrive(observation, extras, False)
+
+    def _arrive(self, observation: Any, extras: Any, over: bool) -> int:
+        """The state of an observation; the first sight of one tells which actions it has."""
+        s = self._read(observation)
+        if type(extras) is not dict:
+            raise WalkFault(f"info must be a mapping, got {extras!r}")
+        mask = self._mask_of(extras)
+        if mask is None:
+            return s
+        known, given = self.masks[s], np.asarray(mask).tobytes()
+        if known != given:
+            self._learn_mask(s, mask, given, over)
+        return s
+
+    def _learn_mask(self, s: int, mask: Any, given: bytes, over: bool) -> None:
+        legal, shape = np.asarray(mask) != 0, self._learner.acting_table.q.shape[1:]
+        if legal.shape != shape:
+            raise WalkFault(f"info['action_mask'] must have {shape[0]} entries, got shape {legal.shape}")
+        if not legal.any():  # a terminal state may say that it has none: nothing is ever chosen there
+            if not over:
+                raise WalkFault("info['action_mask'] must allow an action until the episode has terminated, allows none")
+            return
+        if self.masks[s] is not None and not np.array_equal(self._learner.legal(s), legal):
+            raise WalkFault(
+                f"info['action_mask'] was another one when state {s} was seen before; a table's legal actions belong to "
+                "its states: make the mask part of the observation, or use another learner (--learner online "
+                "--layout table), whose states have their masks beside them"
+            )
+        self.masks[s] = given
+        self._learner.allow_only(s, legal)
+
+
+def _reward(reward: Any) -> float:
+    try:
+        found = float(reward)
+    except Exception as error:
+        raise WalkFault(f"reward must be a number, got {reward!r}") from error
+    if not math.isfinite(found):
+        raise WalkFault(f"reward must be finite, got {found}")
+    return found
+
+
+def _flag(field: str, value: Any) -> bool:
+    """Whether an episode has ended; what is neither yes nor no would be taken for either without a word."""
+    found: NDArray[Any] = np.asarray(value)
+    if found.size == 1 and found.dtype.kind in "biuf" and found.reshape(-1)[0] in (0, 1):
+        return bool(found.reshape(-1)[0])
+    raise WalkFault(f"{field} must be true or false, got {value!r}")
+
+
+def _record(log: Any, i: int, values: tuple[Any, ...]) -> None:
+    for column, value in zip(log[2:], values, strict=True):
+        column[log.offset + i] = value
