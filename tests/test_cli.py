@@ -21,7 +21,7 @@ import pytest
 import yaml
 from gymnasium import spaces
 
-from neuralq.apps.cli import COMMANDS, main, options
+from neuralq.apps.cli import COMMANDS, main, option_table
 from neuralq.learners import learner_kinds
 from neuralq.runs import RunConfig
 from neuralq.runs.folder.run_folder import read_config
@@ -420,8 +420,8 @@ def test_the_help_of_settings_is_read_from_docstrings_of_every_version_of_python
     wanted = {"first": "what is said on two lines.", "second": "the other."}
     # As compiled up to 3.12, from 3.13 on, and under -OO: by itself, and as a dataclass fills it in.
     for doc, found in ((text, wanted), (inspect.cleandoc(text), wanted), (None, {}), ("Some(first: int)", {})):
-        assert options._field_help(type("Some", (), {"__doc__": doc})) == found
-    assert {f.name for f in dataclasses.fields(RunConfig)} <= options._field_help(
+        assert option_table._field_help(type("Some", (), {"__doc__": doc})) == found
+    assert {f.name for f in dataclasses.fields(RunConfig)} <= option_table._field_help(
         RunConfig
     ).keys() | learner_kinds().keys()
 

@@ -12,7 +12,8 @@ from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
 from neuralq.apps.cli import Failure, print_result
-from neuralq.apps.cli.options import add_fields, as_typed, hyphenated, read_config_file, read_options
+from neuralq.apps.cli.option_table import add_fields
+from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
 from neuralq.apps.cli.progress import training_bar
 from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
 from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named

@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from neuralq.apps.cli import Failure, main, print_result
 from neuralq.apps.cli.kinds import say
-from neuralq.apps.cli.options import TrainOptions
+from neuralq.apps.cli.option_table import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
 from neuralq.runs.children import python_command
