@@ -24,6 +24,7 @@ from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Interaction, Policy
 from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.experience import ExperienceSource, Sample
+from neuralq.runs.stream.table import TableWalk
 
 __all__ = ["Session", "cap_on_evaluation"]
 

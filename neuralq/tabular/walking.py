@@ -78,6 +78,7 @@ class EnvironmentWalk:
         seed: of the first reset; None if the environment stands within an episode already.
         remembered: how many of the last transitions are kept in `recent`.
         mask_of: the legal actions ``[A]`` of where the environment stands, of its info; None where it tells none.
+        reward_scale: by what rewards are multiplied for the learner; returns of episodes are not.
     """
 
     def __init__(
@@ -89,12 +90,14 @@ class EnvironmentWalk:
         seed: int | None,
         remembered: int = 1,
         mask_of: Callable[[dict[str, Any]], Any] = lambda extras: extras.get("action_mask"),
+        reward_scale: float = 1.0,
     ) -> None:
         self._env, self._read, self._learner, self._walk = env, read, learner, walk
         self._first_action = int(env.action_space.start)  # type: ignore[attr-defined]
         self._seed, self._mask_of = seed, mask_of
         self.masks: list[bytes | None] = [None] * len(learner.acting_table.q)
-        self.running_return = 0.0
+        self._scale = reward_scale
+        self.running_return, self.num_taken = 0.0, 0
         self.recent = new_log(remembered, REPLAY)
         self._nothing = empty_arrays()
         self._codes: tuple[Callable[..., Any], Callable[..., Any]] | None = None
@@ -129,7 +132,7 @@ class EnvironmentWalk:
         first, limit = self._first_action, int(counters[LIMIT]) or 1 << 62
         on_policy, single, step_of, recording = learner.on_policy, learner.acts_in is not None, self._env.step, log is not None
         s, a, length = int(counters[STATE]), int(counters[ACTION]), int(counters[EPISODE_STEPS])
-        step, total, episodes = int(counters[STEP]), self.running_return, []
+        step, total, scale, episodes = int(counters[STEP]), self.running_return, self._scale, []
         for i in range(num_steps):
             if s < 0:
                 s, length, total = self._begin(), 0, 0.0
@@ -149,7 +152,7 @@ class EnvironmentWalk:
             last = terminated or truncated or length >= limit
             a_t = choose_in(acting, s_t, step + 1, policy, rng) if on_policy and not terminated else -1
             k = step % len(rows)
-            s_tm1[k], a_tm1[k], r[k], discount[k] = s, 0 if single else a, reward, 0.0 if terminated else gamma
+            s_tm1[k], a_tm1[k], r[k], discount[k] = s, 0 if single else a, scale * reward, 0.0 if terminated else gamma
             reached[k], a_next[k], ends[k] = s_t, a_t, last
             if recording:
                 _record(log, i, (s, a, reward, 0.0 if terminated else gamma, s_t, a_t, last))
@@ -162,9 +165,18 @@ class EnvironmentWalk:
         counters[STATE], counters[ACTION], counters[EPISODE_STEPS] = s, a, length
         counters[EPISODES] += len(episodes)
         self.running_return = total
+        self.num_taken += num_steps
         if learner.check is not None:
             learner.check()
         return episodes
+
+    def continue_from(self, running_return: float) -> None:
+        """The environment stands within an episode, or at the end of one, that has earned so much."""
+        self._seed, self.running_return = None, running_return
+
+    def begin_anew(self, seed: int | None) -> None:
+        """The next step begins an episode, with this seed."""
+        self._seed, self.running_return = seed, 0.0
 
     def _begin(self) -> int:
         """The first state of an episode."""

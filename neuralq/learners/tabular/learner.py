@@ -83,7 +83,8 @@ class TabularLearner:
         self.shares = not (self._masked or predicts)
         table = _table(own if self.shares else own.copy())
         acts_in = _table(np.zeros_like(self._entries)) if predicts else None
-        self.loop = _loop(self.plan, table, acts_in, _policy(self.plan, parts), _schedule(self.plan))
+        self._made_of = (table, acts_in, _policy(self.plan, parts), _schedule(self.plan))
+        self.loop = _loop(self.plan, *self._made_of)
         self.walk = new_walk(int(parts.rng.integers(2**63)))
         self._nothing, self._one = empty_arrays(), new_log(1, REPLAY)
 
@@ -101,6 +102,11 @@ class TabularLearner:
     def average_reward(self) -> float | None:
         """The reward per step that R-learning has learned, in the environment's units; None of other algorithms."""
         return float(self.loop.arguments[1][0]) / self._reward_scale if self.settings.algorithm == "r-learning" else None
+
+    def make_room(self, max_outcomes: int) -> None:
+        """Before the first step: a pair has so many different outcomes at most."""
+        if self.settings.algorithm == "prioritized-sweeping" and self.settings.max_outcomes is None:
+            self.loop = _loop({**self.plan, "max_outcomes": max_outcomes}, *self._made_of)
 
     def publish(self) -> None:
         """What was learned becomes the parameters of the representation, where they are not the same memory."""
@@ -260,5 +266,5 @@ TABULAR = LearnerKind(
     traits=_traits,
     check=_check,
     layout="table",
-    place=60,
+    place=6,
 )

@@ -7,7 +7,7 @@ from typing import Any
 
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import NETWORKS, RunConfig, body_to_dict, config_from_dict
+from neuralq.runs.recipe.config import NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
 
 __all__ = ["PRESETS", "preset_for", "with_preset"]
 
@@ -242,7 +242,7 @@ def with_preset(plain: Mapping[str, Any]) -> RunConfig:
     """
     learner = plain.get("learner", RunConfig.learner)
     preset = preset_for(plain.get("env", RunConfig.env), learner)
-    if plain.get("layout", RunConfig.layout) not in NETWORKS:
+    if layout_for(learner, plain.get("layout", RunConfig.layout)) not in NETWORKS:
         preset = {name: value for name, value in preset.items() if name != "body"}
     preset, _ = cut_to_budget(preset, plain)
     given = plain.get(learner) or {}
