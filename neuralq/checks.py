@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "ELSEWHERE",
     "MOST_WHOLE",
     "MissingExtra",
     "available_bytes",
@@ -24,6 +25,9 @@ __all__ = [
 
 MOST_WHOLE = 2**128
 """Whole numbers stay below this: seeds of 128 bits are the longest that anybody draws."""
+
+ELSEWHERE = "neuralq runs on Linux and macOS (it needs file locks as they have them); on Windows install it in WSL 2"
+"""What is said where the standard library has no ``fcntl``."""
 
 
 class MissingExtra(ImportError):

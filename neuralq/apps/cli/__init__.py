@@ -7,6 +7,7 @@ import contextlib
 import contextvars
 import difflib
 import importlib
+import importlib.util
 import itertools
 import json
 import re
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
+from neuralq.checks import ELSEWHERE
 
 __all__ = [
     "COMMANDS",
@@ -237,6 +239,9 @@ def _main(argv: Sequence[str] | None) -> int:
         return 2
     if arguments[0] not in COMMANDS:
         return _top(arguments[0])
+    if importlib.util.find_spec("fcntl") is None:
+        print(f"neuralq: {ELSEWHERE}", file=sys.stderr)
+        return 1
     module, function = COMMANDS[arguments[0]][:2]
     asks = bool({"-h", "--help", "--print_config", "--print-config"} & set(arguments))  # and prints what it is told
     try:
