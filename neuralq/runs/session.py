@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +21,7 @@ from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.stream import Interaction, Policy
+from neuralq.runs.stream import Episode, Interaction, Policy
 from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.experience import ExperienceSource, Sample
 from neuralq.runs.stream.table import TableWalk
@@ -34,9 +34,9 @@ class Session:
     """The mutable parts of a run on an environment; a `neuralq.runs.loop.Trainee`.
 
     Args:
-        stream: experience from the training environments.
-        policy: the behaviour.
-        experience: between stream and learner.
+        stream: experience from the training environments; or a walk, which acts and learns by itself.
+        policy: the behaviour; None with a walk.
+        experience: between stream and learner; None with a walk.
         learner: what learns.
         generators: every generator in use, by name.
         make_evaluation: makes an interaction with environments of its own for evaluation; called when first needed.
@@ -50,9 +50,9 @@ class Session:
         reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
     """
 
-    stream: Interaction
-    policy: Policy
-    experience: ExperienceSource
+    stream: Interaction | TableWalk
+    policy: Policy | None
+    experience: ExperienceSource | None
     learner: Learner
     generators: dict[str, np.random.Generator]
     make_evaluation: Callable[[], Interaction]
@@ -108,7 +108,11 @@ class Session:
 
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
+        if isinstance(self.stream, TableWalk):
+            self._count(self.stream.advance(until, request))
+            return
         stream, experience, learner = self.stream, self.experience, self.learner
+        assert self.policy is not None and experience is not None
         device = learner.engine.flat.values.device
         on_cpu = device.type == "cpu"
         while True:
@@ -116,9 +120,7 @@ class Session:
             experience.add(step)
             if self._early is not None:
                 self._early = self._early.add(step)
-            for episode in step.episodes:
-                self._recent_returns.append(episode.episode_return)
-                self._longest = max(self._longest, episode.length)
+            self._count(step.episodes)
             for sample in experience.draw():
                 transition = sample.transition if on_cpu else sample.transition.map(lambda x: x.to(device))
                 # Weights stay on the host: which are 0 is asked there, and learners that multiply by them move them.
@@ -128,6 +130,11 @@ class Session:
             if experience.between_samples and (stream.num_steps >= until or request.name is not None):
                 return
 
+    def _count(self, episodes: Iterable[Episode]) -> None:
+        for episode in episodes:
+            self._recent_returns.append(episode.episode_return)
+            self._longest = max(self._longest, episode.length)
+
     def training_row(self) -> dict[str, Any]:
         """Mean return of recent episodes, number of updates, and what the last one saw."""
         recent = float(np.mean(self._recent_returns)) if self._recent_returns else None
@@ -135,14 +142,14 @@ class Session:
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed, in the environment's units."""
-        if self._last is None:
+        update = None if self._last is None else self._last[0]
+        if isinstance(self.stream, TableWalk):
+            update = self.stream.last_update()
+        if update is None:
             return self._metrics_before
         seen = self.stream.normalisation
         scale = self.reward_scale * (1.0 if seen is None else seen.reward_scale)
-        return {
-            name: value / (scale * scale if name == "loss" else scale)
-            for name, value in self._last[0].metrics().items()
-        }
+        return {name: value / (scale * scale if name == "loss" else scale) for name, value in update.metrics().items()}
 
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""
@@ -211,7 +218,7 @@ class Session:
                 "longest_episode": self._longest,
             },
             "learner": self.learner.state_dict(),
-            "feed": self.experience.state_dict(),
+            "feed": {} if self.experience is None else self.experience.state_dict(),
             "stream": self.stream.state_dict(),
             "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
@@ -221,6 +228,8 @@ class Session:
         """The environments' own state; None where it cannot be taken, or no longer can."""
         if not self.resumability.exact:
             return None
+        if isinstance(self.stream, TableWalk) and self.stream.simulated:
+            return {}
         try:
             return encode_env(self.stream.envs)
         except NotCopyable as error:
@@ -242,7 +251,8 @@ class Session:
         self._metrics_before = progress["last_metrics"]
         self._longest = int(progress.get("longest_episode", 0))
         self.learner.load_state_dict(state["learner"])
-        self.experience.load_state_dict(state["feed"])
+        if self.experience is not None:
+            self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]
         if self._restored(state["environments"]):
@@ -254,8 +264,8 @@ class Session:
             self.learner.begin_streams()
 
     def _restored(self, environments: Mapping[str, Any] | None) -> bool:
-        if environments is None:
-            return False
+        if not environments:  # none where a model is simulated
+            return environments is not None
         try:
             restore_env(self.stream.envs, environments)
         except NotCopyable as error:
@@ -265,9 +275,10 @@ class Session:
 
     def close(self) -> None:
         """Close the environments."""
-        for stream in filter(None, (self.stream, self._evaluation)):
-            with contextlib.suppress(Exception):
-                stream.envs.close()
+        for envs in (self.stream.envs, None if self._evaluation is None else self._evaluation.envs):
+            if envs is not None:
+                with contextlib.suppress(Exception):
+                    envs.close()
 
 
 def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+
 import numpy as np
 
 from neuralq.checks import check_fraction
-from neuralq.tabular.engine import RunOptions, Source, learn, new_table, table_from
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table
 from neuralq.tabular.kernels.acting import Table
 from neuralq.tabular.kernels.r_learning import run_r_learning
 from neuralq.tabular.kernels.random_numbers import Seed

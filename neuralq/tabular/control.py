@@ -167,7 +167,9 @@ def apply(
         [[0.0], [100.0]]
     """
     check_choice("rule", rule, RULES)
-    return replay(one_step_learner(rule, table_from(q), policy, step_code(step_size, len(experience))), experience, seed)
+    return replay(
+        one_step_learner(rule, table_from(q), policy, step_code(step_size, len(experience))), experience, seed
+    )
 
 
 def _learn(
@@ -181,7 +183,9 @@ def _learn(
     options: RunOptions,
 ) -> Learned:
     table, ready = new_table(source, options)
-    return learn(one_step_learner(rule, table, policy, step_code(step_size, num_steps)), ready, num_steps, gamma, seed, options)
+    return learn(
+        one_step_learner(rule, table, policy, step_code(step_size, num_steps)), ready, num_steps, gamma, seed, options
+    )
 
 
 def one_step_learner(rule: str, table: Table, policy: PolicyLike, step_size: StepCode) -> Learner:

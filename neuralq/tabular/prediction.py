@@ -18,7 +18,7 @@ from neuralq.tabular.kernels.td import KINDS, UPDATES, run_td
 from neuralq.tabular.kernels.traces import new_traces
 from neuralq.tabular.learner import Learner
 from neuralq.tabular.model import complete_outcomes, empty_arrays
-from neuralq.tabular.policies import CONSTANT, RANDOM, StepCode, StepSizeLike, acting_code, step_code
+from neuralq.tabular.policies import CONSTANT, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
 
 __all__ = ["batch_td", "predict", "td_lambda", "td_learner", "under_policy"]

@@ -42,7 +42,7 @@ _FLAGS = (bool, np.bool_)
 
 
 class WalkFault(RuntimeError):
-    """An environment raised, or handed out what its spaces did not promise; says in which field."""
+    """An environment raised, which is the cause, or handed out what its spaces did not promise; says in which field."""
 
 
 def state_reader(space: Discrete) -> Callable[[Any], int]:
@@ -99,6 +99,7 @@ class EnvironmentWalk:
         self._scale = reward_scale
         self.running_return, self.num_taken = 0.0, 0
         self.recent = new_log(remembered, REPLAY)
+        self._rows = [self.recent._replace(offset=row) for row in range(remembered)]
         self._nothing = empty_arrays()
         self._codes: tuple[Callable[..., Any], Callable[..., Any]] | None = None
 
@@ -124,51 +125,59 @@ class EnvironmentWalk:
             ValueError: the learner cannot learn from what came.
         """
         learn, choose_in = self._compiled(float(gamma))
-        learner, walk, recent = self._learner, self._walk, self.recent
-        counters, rng, policy, acting = walk.counters, walk.rng, learner.policy, learner.acting_table
-        s_tm1, a_tm1, r, discount, reached, a_next, ends = recent[2:]
-        before, after = (self._nothing, policy, learner.table, walk), (*learner.arguments, float(gamma), 1)
-        rows = [recent._replace(offset=row) for row in range(len(r))]
-        first, limit = self._first_action, int(counters[LIMIT]) or 1 << 62
-        on_policy, single, step_of, recording = learner.on_policy, learner.acts_in is not None, self._env.step, log is not None
+        learner, counters, rng, rows = self._learner, self._walk.counters, self._walk.rng, self._rows
+        policy, acting, on_policy, single = learner.policy, learner.acting_table, learner.on_policy, learner.acts_in
+        before, after = (self._nothing, policy, learner.table, self._walk), (*learner.arguments, float(gamma), 1)
+        s_tm1, a_tm1, r, discount, reached, a_next, ends = self.recent[2:]
         s, a, length = int(counters[STATE]), int(counters[ACTION]), int(counters[EPISODE_STEPS])
-        step, total, scale, episodes = int(counters[STEP]), self.running_return, self._scale, []
+        step, total, scale, limit = (
+            int(counters[STEP]),
+            self.running_return,
+            self._scale,
+            int(counters[LIMIT]) or 1 << 62,
+        )
+        episodes: list[Episode] = []
         for i in range(num_steps):
             if s < 0:
                 s, length, total = self._begin(), 0, 0.0
             if a < 0:
                 a = choose_in(acting, s, step, policy, rng)
-            try:
-                observation, reward, terminated, truncated, extras = step_of(a + first)
-            except (Exception, SystemExit) as error:
-                raise WalkFault("step") from error
-            if type(reward) is not float or not math.isfinite(reward):
-                reward = _reward(reward)
-            if type(terminated) not in _FLAGS or type(truncated) not in _FLAGS:
-                terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
+            observation, reward, terminated, truncated, extras = self._take(a)
             s_t = self._arrive(observation, extras, terminated)
             length += 1
             total += reward
             last = terminated or truncated or length >= limit
             a_t = choose_in(acting, s_t, step + 1, policy, rng) if on_policy and not terminated else -1
             k = step % len(rows)
-            s_tm1[k], a_tm1[k], r[k], discount[k] = s, 0 if single else a, scale * reward, 0.0 if terminated else gamma
+            s_tm1[k], a_tm1[k], r[k], discount[k] = s, a if single is None else 0, scale * reward, gamma
             reached[k], a_next[k], ends[k] = s_t, a_t, last
-            if recording:
-                _record(log, i, (s, a, reward, 0.0 if terminated else gamma, s_t, a_t, last))
+            if terminated:
+                discount[k] = 0.0
+            if log is not None:
+                _copy_row(self.recent, k, log, i)
             learn(*before, rows[k], *after)
-            step += 1
-            s, a = s_t, a_t
+            step, s, a = step + 1, s_t, a_t
             if last:
                 episodes.append((total, length))
                 s, a, length, total = -1, -1, 0, 0.0
         counters[STATE], counters[ACTION], counters[EPISODE_STEPS] = s, a, length
         counters[EPISODES] += len(episodes)
-        self.running_return = total
-        self.num_taken += num_steps
+        self.running_return, self.num_taken = total, self.num_taken + num_steps
         if learner.check is not None:
             learner.check()
         return episodes
+
+    def _take(self, a: int) -> tuple[Any, float, bool, bool, Any]:
+        """One step of the environment, its reward and its flags looked at."""
+        try:
+            observation, reward, terminated, truncated, extras = self._env.step(a + self._first_action)
+        except (Exception, SystemExit) as error:
+            raise WalkFault("step") from error
+        if type(reward) is not float or not math.isfinite(reward):
+            reward = _reward(reward)
+        if type(terminated) not in _FLAGS or type(truncated) not in _FLAGS:
+            terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
+        return observation, reward, terminated, truncated, extras
 
     def continue_from(self, running_return: float) -> None:
         """The environment stands within an episode, or at the end of one, that has earned so much."""
@@ -206,13 +215,15 @@ class EnvironmentWalk:
             raise WalkFault(f"info['action_mask'] must have {shape[0]} entries, got shape {legal.shape}")
         if not legal.any():  # a terminal state may say that it has none: nothing is ever chosen there
             if not over:
-                raise WalkFault("info['action_mask'] must allow an action until the episode has terminated, allows none")
+                raise WalkFault(
+                    "info['action_mask'] must allow an action until the episode has terminated, allows none"
+                )
             return
         if self.masks[s] is not None and not np.array_equal(self._learner.legal(s), legal):
             raise WalkFault(
-                f"info['action_mask'] was another one when state {s} was seen before; a table's legal actions belong to "
-                "its states: make the mask part of the observation, or use another learner (--learner online "
-                "--layout table), whose states have their masks beside them"
+                f"info['action_mask'] was another one when state {s} was seen before; in a table actions are legal or "
+                "not by the state: make what decides it part of the observation, or take --learner online --layout "
+                "table, which is handed the mask with every observation"
             )
         self.masks[s] = given
         self._learner.allow_only(s, legal)
@@ -221,8 +232,8 @@ class EnvironmentWalk:
 def _reward(reward: Any) -> float:
     try:
         found = float(reward)
-    except Exception as error:
-        raise WalkFault(f"reward must be a number, got {reward!r}") from error
+    except Exception:
+        raise WalkFault(f"reward must be a number, got {reward!r}") from None
     if not math.isfinite(found):
         raise WalkFault(f"reward must be finite, got {found}")
     return found
@@ -236,6 +247,6 @@ def _flag(field: str, value: Any) -> bool:
     raise WalkFault(f"{field} must be true or false, got {value!r}")
 
 
-def _record(log: Any, i: int, values: tuple[Any, ...]) -> None:
-    for column, value in zip(log[2:], values, strict=True):
-        column[log.offset + i] = value
+def _copy_row(source: Log, k: int, log: Log, i: int) -> None:
+    for column, values in zip(log[2:], source[2:], strict=True):
+        column[log.offset + i] = values[k]

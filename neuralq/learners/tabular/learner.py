@@ -18,7 +18,6 @@ from neuralq.tabular.kernels.acting import (
     ACTION,
     EPISODE_STEPS,
     REPLAY,
-    SARSA,
     STATE,
     STEP,
     Log,
@@ -28,7 +27,6 @@ from neuralq.tabular.kernels.acting import (
     new_walk,
 )
 from neuralq.tabular.kernels.sweeping import FULL, new_memory
-from neuralq.tabular.kernels.traces import RULES as TRACE_RULES
 from neuralq.tabular.learner import Learner as Loop
 from neuralq.tabular.model import empty_arrays
 from neuralq.tabular.n_step import n_step_learner
@@ -72,7 +70,9 @@ class TabularLearner:
         self._reward_scale = parts.reward_scale
         values = parts.engine.flat.values
         if values.dtype != torch.float64 or values.device.type != "cpu":
-            raise ValueError(f"the tabular learner computes in float64 on the CPU, got {values.dtype} on {values.device}")
+            raise ValueError(
+                f"the tabular learner computes in float64 on the CPU, got {values.dtype} on {values.device}"
+            )
         self._masked = isinstance(parts.engine.q, MaskedQ)
         num_actions = parts.engine.q.num_actions
         values.fill_(self.settings.initial_q * parts.reward_scale)
@@ -101,7 +101,9 @@ class TabularLearner:
     @property
     def average_reward(self) -> float | None:
         """The reward per step that R-learning has learned, in the environment's units; None of other algorithms."""
-        return float(self.loop.arguments[1][0]) / self._reward_scale if self.settings.algorithm == "r-learning" else None
+        return (
+            float(self.loop.arguments[1][0]) / self._reward_scale if self.settings.algorithm == "r-learning" else None
+        )
 
     def make_room(self, max_outcomes: int) -> None:
         """Before the first step: a pair has so many different outcomes at most."""

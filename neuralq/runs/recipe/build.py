@@ -9,7 +9,7 @@ import contextlib
 import copy
 import importlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -27,7 +27,7 @@ from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
 from neuralq.runs.evaluation import MOST_STEPS
-from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resumable, untried
+from neuralq.runs.folder.env_probe import PROBE_SECONDS, SIMULATED, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
@@ -37,6 +37,7 @@ from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, mak
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
+from neuralq.runs.stream.table import TableWalk
 from neuralq.types import QFunction, Transition
 from neuralq_envs import vector_twin
 
@@ -198,6 +199,8 @@ def build_session(config: RunConfig) -> Session:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
     _check_device(config.device)
+    if config.kind.experience == "table":
+        return _walking_session(config)
     envs = make_envs(config, _num_envs(config), training=True)
     try:
         return _session(config, envs)
@@ -248,7 +251,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     frozen = None if normalisation is None else normalisation.frozen()
-    probe = _probe(config, envs)
+    probe = _probe(config, envs, lambda: make_envs(config, _num_envs(config), training=True))
     _warm(config, engine, stream)
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
@@ -256,6 +259,39 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
         _value_range(config.settings),
     )  # fmt: skip
+
+
+def _walking_session(config: RunConfig) -> Session:
+    """Of a learner that acts by itself, in one environment or its model."""
+    envs = _make_one(config)
+    try:
+        simulate = config.settings.simulate
+        stream = TableWalk(envs, config.gamma, seed_for(config.seed, 0), simulate, config.reward_scale)
+        rng = np.random.default_rng(seed_for(config.seed, 2))
+        require_room(config, stream.spec)
+        engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(config.settings), config.engine)
+        learner = _learner(config, engine, stream.spec, rng)
+        stream.begin(learner)
+        cap = MOST_STEPS if config.evaluation_max_steps is None and stream.time_limit else config.evaluation_max_steps
+        return Session(
+            stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None),
+            SIMULATED if stream.simulated else _probe(config, envs, lambda: _make_one(config)),
+            config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+        )  # fmt: skip
+    except BaseException:
+        with contextlib.suppress(Exception):
+            envs.close()
+        raise
+
+
+def _make_one(config: RunConfig) -> gym.Env[Any, Any]:
+    """The single environment that is trained on."""
+    module, _, env_id = config.env.rpartition(":")
+    register_games(env_id)
+    with refusals_name(config.env):
+        if module:
+            importlib.import_module(module)
+        return make_single(env_id, config.env_kwargs, None, config.clip_rewards, config.end_on_life_loss)
 
 
 def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
@@ -267,11 +303,11 @@ def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
         raise
 
 
-def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
+def _probe(config: RunConfig, envs: Any, make: Callable[[], Any]) -> Resumability:
     if not config.resume_probe:
         return untried(envs)
     return is_resumable(
-        lambda: make_envs(config, _num_envs(config), training=True),
+        make,
         seed_for(config.seed, 5),
         np.random.default_rng(seed_for(config.seed, 6)),
         PROBE_SECONDS,
@@ -317,6 +353,7 @@ def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.r
     parts = Parts(
         engine, config.settings, rng, config.gamma, config.reward_scale, config.total_steps, config.engine,
         another=lambda: _q_on_device(config, spec, 11),
+        exploration=(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps),
     )  # fmt: skip
     return config.kind.build(parts)
 

@@ -16,7 +16,16 @@ from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
 from neuralq.runs.recipe.games import is_screen
 
-__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict", "fitted_value", "layout_for"]
+__all__ = [
+    "LAYOUTS",
+    "LEARNERS",
+    "RunConfig",
+    "body_to_dict",
+    "config_from_dict",
+    "config_to_dict",
+    "fitted_value",
+    "layout_for",
+]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
@@ -230,7 +239,7 @@ def _check_exploration(config: RunConfig) -> None:
     plan = getattr(config.settings, "plan", {})
     if plan.get("policy", "epsilon-greedy") == "epsilon-greedy":
         return
-    for name in ("epsilon_start", "epsilon_end", "epsilon_decay_steps"):
+    for name in ("epsilon_start", "epsilon_end"):  # how fast ε falls is also said by the budget
         if getattr(config, name) != getattr(RunConfig, name):
             raise ValueError(
                 f"{name} would be ignored with the policy {plan['policy']!r}; leave it out, or act ε-greedily"

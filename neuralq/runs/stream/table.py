@@ -7,16 +7,17 @@ the loop, else one step of the environment at a time, without the general stream
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from neuralq.learners.learner import Update
+from neuralq.learners.learner import Learner, Update
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
 from neuralq.runs.stream.faults import EnvironmentFault, describe_error
 from neuralq.runs.stream.stream import Episode, ObservationSpec
@@ -30,7 +31,7 @@ from neuralq.types import Array
 __all__ = ["TableWalk"]
 
 _REMEMBERED = 64
-_MOST_AT_ONCE = 1 << 16
+_SIMULATED, _STEPPED = 1 << 16, 1 << 7  # steps before it is asked whether to stop
 
 
 class TableWalk:
@@ -81,6 +82,11 @@ class TableWalk:
         self._return = 0.0
 
     @property
+    def time_limit(self) -> int | None:
+        """After how many steps an episode is cut, where a wrapper does that."""
+        return _time_limit(self.envs)
+
+    @property
     def simulated(self) -> bool:
         """Whether the model is simulated, and the environment left alone."""
         return self.mdp is not None
@@ -112,8 +118,9 @@ class TableWalk:
         self._allowed = np.where((allowed & mdp.legal).any(1, keepdims=True), allowed, mdp.legal)
         return mdp, ""
 
-    def begin(self, learner: TabularLearner) -> None:
+    def begin(self, walking: Learner) -> None:
         """From now on this learner walks; what it calls is compiled."""
+        learner = cast(TabularLearner, walking)
         self._learner, walk = learner, learner.walk
         self.recent, self._num_recent = new_log(_REMEMBERED, REPLAY), 0
         if self.mdp is None:
@@ -123,12 +130,12 @@ class TableWalk:
             self.recent = self._steps.recent
             self._steps.run(learner.gamma, 0)
             return
-        walk.counters[LIMIT] = _time_limit(self.envs) or 0
+        walk.counters[LIMIT] = self.time_limit or 0
         legal = self.mdp.legal if self._allowed is None else self.mdp.legal & self._allowed
         self._model_arrays = self._compiled(learner, legal)
         for s in np.flatnonzero(~self.mdp.is_terminal & ~legal.all(1)):
             learner.loop.allow_only(int(s), legal[s])
-        self._log = new_log(_MOST_AT_ONCE, RECORD)
+        self._log = new_log(_SIMULATED, RECORD)
         learner.loop.run(self._model_arrays.arrays, walk, self._log, learner.gamma, 0)
 
     def _compiled(self, learner: TabularLearner, legal: Array) -> Model:
@@ -147,8 +154,8 @@ class TableWalk:
             compiled.arrays._replace(reward=compiled.arrays.reward * self._scale), compiled.legal, compiled.max_outcomes
         )
 
-    def advance(self, until: int) -> list[Episode]:
-        """Walk and learn until so many steps were taken in all; the episodes that ended on the way.
+    def advance(self, until: int, request: StopRequest) -> list[Episode]:
+        """Walk and learn until so many steps were taken in all, or a stop is asked for; the episodes that ended.
 
         Raises:
             EnvironmentFault: the environment raised, or handed out what its spaces did not promise.
@@ -157,8 +164,9 @@ class TableWalk:
         if self._broken:
             raise EnvironmentFault("this walk has ended with an error; start a new one")
         assert self._learner is not None
-        count = until - self.num_steps
-        ended = self._simulate(count) if self.simulated else self._step(count)
+        ended: list[tuple[float, int]] = []
+        while (left := until - self.num_steps) > 0 and request.name is None:
+            ended += self._simulate(min(left, _SIMULATED)) if self.simulated else self._step(min(left, _STEPPED))
         self._learner.publish()
         return [Episode(0, episode_return, length) for episode_return, length in ended]
 
@@ -172,28 +180,20 @@ class TableWalk:
             raise EnvironmentFault(f"after {self.num_steps:,} environment steps, {what}") from fault
 
     def _simulate(self, count: int) -> list[tuple[float, int]]:
-        learner, log, episodes = self._learner, self._log, []
+        learner, log = self._learner, self._log
         assert learner is not None
-        while count > 0:
-            some = min(count, _MOST_AT_ONCE)
-            begun = int(learner.walk.counters[EPISODE_STEPS])
-            learner.loop.run(self._model_arrays.arrays, learner.walk, log, learner.gamma, some)
-            ends = np.flatnonzero(log.last_t[:some])
-            # From the end of one episode to the next; the first began in an earlier call, the last goes on.
-            sums = np.add.reduceat(log.r_t[:some], np.append(0, ends[ends + 1 < some] + 1))
-            sums[0] += self._return
-            lengths = np.diff(ends, prepend=-1 - begun)
-            self._return = 0.0 if len(sums) == len(ends) else float(sums[-1])
-            episodes += zip((sums[: len(ends)] / self._scale).tolist(), lengths.tolist(), strict=True)
-            self._keep_last(some)
-            count -= some
-        return episodes
-
-    def _keep_last(self, some: int) -> None:
-        kept = min(some, _REMEMBERED)
-        for column, source in zip(self.recent[2:], self._log[2:], strict=True):
-            column[:kept] = source[some - kept : some]
-        self._num_recent = kept
+        begun = int(learner.walk.counters[EPISODE_STEPS])
+        learner.loop.run(self._model_arrays.arrays, learner.walk, log, learner.gamma, count)
+        ends = np.flatnonzero(log.last_t[:count])
+        # From the end of one episode to the next; the first began in an earlier call, the last goes on.
+        sums = np.add.reduceat(log.r_t[:count], np.append(0, ends[ends + 1 < count] + 1)) / self._scale
+        sums[0] += self._return
+        lengths = np.diff(ends, prepend=-1 - begun)
+        self._return = 0.0 if len(sums) == len(ends) else float(sums[-1])
+        for column, source in zip(self.recent[2:], log[2:], strict=True):
+            column[: min(count, _REMEMBERED)] = source[max(0, count - _REMEMBERED) : count]
+        self._num_recent = min(count, _REMEMBERED)
+        return list(zip(sums[: len(ends)].tolist(), lengths.tolist(), strict=True))
 
     def last_update(self) -> Update | None:
         """The errors of the last steps, by the values as they are now; None before the first."""
@@ -213,7 +213,7 @@ class TableWalk:
     def running_episodes(self) -> list[tuple[float, int]]:
         """Return so far and length of the unfinished episode."""
         assert self._learner is not None
-        so_far = self._return / self._scale if self.simulated else self._steps.running_return
+        so_far = self._return if self.simulated else self._steps.running_return
         return [(so_far, int(self._learner.walk.counters[EPISODE_STEPS]))]
 
     def state_dict(self) -> dict[str, Any]:
@@ -260,7 +260,7 @@ def _reader(space: spaces.Space[Any], encoder: Encoder) -> Callable[[Any], int]:
         try:
             return int(encoder.encode_single(observation))
         except ObservationError as error:
-            raise WalkFault(f"{error.field} {error.problem}") from error
+            raise WalkFault(f"{error.field} {error.problem}") from None
 
     if isinstance(space, spaces.Discrete):
         return state_reader(space)
