@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,8 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     """
     if type(value) is int and abs(value) >= MOST_WHOLE:  # beyond any use, and 10^309 is beyond any float
         raise ValueError(f"{name} must be a whole number below 2^128, got one of {value.bit_length():,} bits")
-    if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < minimum:
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or int(value) != value or value < minimum:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 
 

@@ -22,7 +22,8 @@ from neuralq.apps.cli import export as export_module
 from neuralq.apps.cli import main
 from neuralq.runs import RunConfig, load
 from neuralq.runs.agent import Agent
-from neuralq.runs.recipe.build import build_q, make_envs
+from neuralq.runs.recipe.build import build_q
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.stream import Interaction, Normalisation
 from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.sweep import create_sweep

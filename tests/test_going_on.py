@@ -29,7 +29,7 @@ from neuralq.runs.control import CONTROL
 from neuralq.runs.folder import origin
 from neuralq.runs.folder.checkpoint import CheckpointError, load_newest
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, read_config, read_metrics
-from neuralq.runs.recipe.build import make_envs
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.sweep import create_sweep
 from neuralq_envs import CLASSIC
 

@@ -112,7 +112,7 @@ def test_a_simulated_walk_counts_returns_and_obeys_the_time_limit() -> None:
     session = build_session(config(settings={"policy": "random"}, env_kwargs=cut))
     stream = session.stream
     assert isinstance(stream, TableWalk) and stream.simulated and stream.time_limit == 5
-    episodes = []
+    episodes: list[Any] = []
     for until in range(7, 700, 7):  # no multiple of an episode's length
         episodes += stream.advance(until, StopRequest())
     assert (
@@ -189,6 +189,25 @@ def test_states_of_a_tuple_are_those_of_the_encoder() -> None:
     for wrong in [(3, 0, 0), (0, -2, 0), (0, 0), None]:
         with pytest.raises(WalkFault):
             read(wrong)
+
+
+def test_a_hook_sees_every_step_and_changes_nothing(tmp_path: Path) -> None:
+    class Sees:
+        def __init__(self) -> None:
+            self.steps: list[tuple[Any, ...]] = []
+
+        def on_step(self, session: Any) -> None:
+            one = session.step
+            self.steps.append((one.s_tm1[0], one.a_tm1[0], one.r_t[0], one.s_t[0], one.discount_t[0] == 0))
+
+    sees = Sees()
+    made = config("Corridor-v0", gamma=0.9, reward_scale=0.5, total_steps=50)
+    watched = neuralq.train(made, tmp_path / "watched", hooks=[sees])
+    assert sees.steps == [step[:5] for step in SEEN[:50]]
+    assert neuralq.train(made, tmp_path / "alone").parameters_sha256 == watched.parameters_sha256
+    within = Sees()
+    neuralq.train(config(total_steps=50), tmp_path / "model", hooks=[within])
+    assert len(within.steps) == 50 and within.steps[0][0] == 0
 
 
 def test_a_stop_is_obeyed_within_the_next_hundred_steps() -> None:

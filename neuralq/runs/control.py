@@ -29,12 +29,11 @@ from neuralq.runs.recipe.build import (
     build_q,
     build_session,
     engine_name,
-    make_envs,
-    make_evaluation_envs,
     normalisation_for,
     plan_of,
 )
 from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
@@ -59,6 +58,7 @@ class Run:
         interrupted_by: name of the signal that ended it early, or None.
         resumability: how exactly it can be resumed, in words.
         engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
+        stopped_by: which hook ended it before its budget was spent, and why; None if none did.
     """
 
     run_dir: Path
@@ -71,6 +71,7 @@ class Run:
     interrupted_by: str | None
     resumability: str
     engine: str
+    stopped_by: str | None = None
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -79,9 +80,13 @@ class Run:
     def lines(self) -> list[str]:
         """The same for people."""
         score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        stopped = (
+            [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
+        )
         return [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
-            f"{self.wall_seconds:.2f} seconds in all; {score}"
+            f"{self.wall_seconds:.2f} seconds in all; {score}",
+            *stopped,
         ]
 
 
@@ -97,6 +102,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         interrupted_by=progress.interrupted_by,
         resumability=session.resumability.reason if progress.moved is None else f"{NOT_EXACT}: {progress.moved}",
         engine=engine_name(session.learner),
+        stopped_by=progress.stopped_by,
     )
 
 

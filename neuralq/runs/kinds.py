@@ -200,7 +200,7 @@ class Kind(Generic[C, T, R]):
                 say_to(hooks, line)
             if isinstance(trainee, Speaks):
                 trainee.say = functools.partial(say_to, hooks)
-            fit(trainee, plan, progress, folder, hooks)
+            fit(trainee, plan, progress, folder, hooks, config)
         else:
             warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)

@@ -6,12 +6,10 @@ its `Progress`; a checkpoint holds exactly the first and the last, so a run that
 
 from __future__ import annotations
 
-import logging
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,6 +20,7 @@ from neuralq.runs.folder.best import Best, keep_best
 from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
 from neuralq.runs.stop_request import StopAsked, StopRequest
 from neuralq.runs.stream.experience import Sample
+from neuralq.runs.watching import Hook, HookFault, Listener, Observer, Watch, say_to
 
 __all__ = [
     "NOT_EXACT",
@@ -44,57 +43,11 @@ __all__ = [
 NOT_EXACT = "the run goes on from the state that was saved, but not with the same bits for certain"
 
 
-class Hook(Protocol):
-    """Takes every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
-
-    def __call__(self, row: Mapping[str, Any], /) -> None:
-        """Take in one row."""
-        ...
-
-
-@runtime_checkable
-class Observer(Protocol):
-    """A hook that also looks at the learner: what was last learned from is shown to it before each row.
-
-    It reads, never writes: neither the learner nor the sample, of which it copies what it wants to keep.
-    """
-
-    def observe(self, learner: Learner, sample: Sample, /) -> None:
-        """Read the learner and the sample it last learned from."""
-        ...
-
-    def __call__(self, row: Mapping[str, Any], /) -> None:
-        """Take in one row."""
-        ...
-
-
-@runtime_checkable
-class Listener(Protocol):
-    """A hook that is also told, in a line each, what is worth knowing of a run before it begins."""
-
-    def say(self, line: str, /) -> None:
-        """Take in one line."""
-        ...
-
-
 @runtime_checkable
 class Speaks(Protocol):
     """A trainee that may have something to say while it trains; it is given ``say``."""
 
     say: Callable[[str], None]
-
-
-def say_to(hooks: Sequence[Hook], line: str) -> None:
-    """A line to every hook that listens; a warning that nobody listens to goes to the log ``neuralq``."""
-    listeners = [hook for hook in hooks if isinstance(hook, Listener)]
-    for listener in listeners:
-        listener.say(line)
-    if not listeners and line.startswith("warning: "):
-        logging.getLogger("neuralq").warning(line.removeprefix("warning: "))
-
-
-class HookFault(RuntimeError):
-    """A hook raised; the run was saved where it stood."""
 
 
 class Diverged(RuntimeError):
@@ -195,7 +148,9 @@ class Progress:
         reached_at: amount at which ``stop_at_return`` was first met.
         finished: whether the run has ended by itself.
         interrupted_by: name of the signal that ended it early.
+        stopped_by: which hook ended it early, and why.
         moved: what decides the arithmetic and was not the same all along, in words.
+        hook_states: what hooks have to remember, by name.
     """
 
     cpu_seconds: float = 0.0
@@ -209,7 +164,9 @@ class Progress:
     next_checkpoint: int = 0
     next_log: int = 0
     interrupted_by: str | None = None
+    stopped_by: str | None = None
     moved: str | None = None
+    hook_states: dict[str, Any] = field(default_factory=dict)
 
 
 def seed_for(seed: int, *purpose: int) -> int:
@@ -241,35 +198,43 @@ def continued(trainee: Trainee, folder: RunFolder) -> Progress:
     warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))
     known = {f.name for f in fields(Progress)}
     progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
+    progress.hook_states = dict(state.get("hooks", {}))
     if moved is not None:
         progress.moved = moved if progress.moved is None else f"{progress.moved}; {moved}"
         warnings.warn(f"{NOT_EXACT}: {moved}", stacklevel=2)
     return progress
 
 
-def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> None:
-    """Train until the plan is met, the budget is spent or a signal asks to stop; the folder then holds a checkpoint.
+def fit(
+    trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = (), config: Any = None
+) -> None:
+    """Train until the plan is met, the budget is spent, or a hook or a signal asks to stop; then there is a checkpoint.
 
     Args:
         trainee: what trains; changed in place.
         plan: when to evaluate, save and stop.
         progress: where to begin; changed in place.
         folder: an open run folder.
-        hooks: called with each row of metrics.
+        hooks: called with each row of metrics, and shown what they ask for.
+        config: of the run, for hooks.
 
     Raises:
         EnvironmentFault: if an environment breaks its contract. The last checkpoint stays as it is.
         Diverged: if the parameters stop being finite. Likewise.
         HookFault: if a hook raises, once the run is saved.
     """
-    loop = _Loop(trainee, plan, progress, folder, hooks)
     request = StopRequest()
+    watch = Watch(hooks, trainee, progress, folder, config, request)
+    watch.restore()
+    loop = _Loop(trainee, plan, progress, folder, watch)
     with request.listening():
         try:
-            loop.run(request)
-        except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
-            loop._book(training=False)
-            loop.interrupted(request)
+            try:
+                loop.run(request)
+            except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
+                loop._book(training=False)
+                loop.interrupted(request)
+            loop.ended()
         except HookFault as fault:
             loop._save(request)
             raise HookFault(
@@ -281,21 +246,11 @@ def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hoo
             raise
 
 
-def _told_of(hook: Hook, error: Exception) -> str:
-    """Which hook, what it raised, and where in its code."""
-    name = getattr(hook, "__qualname__", type(hook).__qualname__)
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
-    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"the hook {name} raised {type(error).__name__}: {error}{place}"
-
-
 class _Loop:
-    def __init__(
-        self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]
-    ) -> None:
-        self.trainee, self.plan, self.progress, self.folder, self.hooks = trainee, plan, progress, folder, hooks
+    def __init__(self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, watch: Watch) -> None:
+        self.trainee, self.plan, self.progress, self.folder, self.watch = trainee, plan, progress, folder, watch
         progress.finished = False
-        progress.interrupted_by = None
+        progress.interrupted_by = progress.stopped_by = None
         progress.next_evaluation = progress.next_evaluation or plan.evaluate_every
         progress.next_checkpoint = progress.next_checkpoint or plan.checkpoint_every
         if plan.log_whole_periods:
@@ -311,6 +266,7 @@ class _Loop:
         while not reached and trainee.amount < plan.budget:
             next_look = min(progress.next_log, progress.next_evaluation, progress.next_checkpoint, plan.budget)
             trainee.advance(next_look, request)
+            self.watch.require_sound()
             amount = trainee.amount
             if amount >= progress.next_log or (plan.log_whole_periods and amount >= plan.budget):
                 self._log()
@@ -318,6 +274,9 @@ class _Loop:
                 self._evaluate(request)
                 reached = plan.stop_at_return is not None and progress.reached_at is not None
             if reached:
+                break
+            if request.by_hook:  # nothing is abandoned: the run ends here as it would at its budget
+                progress.stopped_by = self.watch.stopped_by if amount < plan.budget else None
                 break
             if request.name is not None:
                 self.interrupted(request)
@@ -328,6 +287,13 @@ class _Loop:
             self._evaluate(request)
         progress.finished = True
         self._save(request)
+
+    def ended(self) -> None:
+        """Tell the hooks, once all is saved."""
+        progress = self.progress
+        reached = self.plan.stop_at_return is not None and progress.reached_at is not None
+        self.watch.ended_by = progress.interrupted_by or progress.stopped_by or ("target" if reached else "budget")
+        self.watch.call("on_end")
 
     def interrupted(self, request: StopRequest) -> None:
         self.progress.interrupted_by = request.name
@@ -355,14 +321,9 @@ class _Loop:
             **columns,
         }
         self.folder.append_metrics(row)
-        observed = trainee.observed
-        for hook in self.hooks:
-            try:
-                if observed is not None and isinstance(hook, Observer):
-                    hook.observe(*observed)
-                hook(row)
-            except Exception as error:
-                raise HookFault(_told_of(hook, error)) from error
+        self.watch.row(row)
+        if kind == "evaluation":
+            self.watch.call("on_evaluation")
         self._book(training=False)  # whoever watches costs wall time only
 
     def _log(self) -> None:
@@ -405,13 +366,17 @@ class _Loop:
     def _save(self, request: StopRequest) -> None:
         with request.saving():
             self._checkpoint()
+        self.watch.require_sound()
 
     def _checkpoint(self) -> None:
         self.progress.next_checkpoint = self._after(self.plan.checkpoint_every)
         self.trainee.require_finite()
         self._book()
         state = self.trainee.state_dict()
-        state["progress"] |= {name: value for name, value in asdict(self.progress).items() if value is not None}
+        known = {f.name: getattr(self.progress, f.name) for f in fields(self.progress) if f.name != "hook_states"}
+        state["progress"] |= {name: value for name, value in known.items() if value is not None}
         state["progress"]["num_rows"] = self.folder.num_rows
+        if hooks := self.watch.states():
+            state["hooks"] = hooks
         state["origin"] = self._origin()
         checkpoint.save(self.folder.checkpoints_path, self.trainee.env_steps, state)

@@ -14,6 +14,7 @@ import torch
 
 from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
+from neuralq.runs.agent import Agent
 from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder.best import Best
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
@@ -21,10 +22,12 @@ from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.stream import Episode, Interaction, Policy
+from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
+from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.runs.stream.experience import ExperienceSource, Sample
 from neuralq.runs.stream.table import TableWalk
+from neuralq.types import Array
 
 __all__ = ["Session", "cap_on_evaluation"]
 
@@ -71,6 +74,9 @@ class Session:
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
     say: Callable[[str], None] = field(init=False, default=lambda line: None)
     _early: EarlyReturns | None = field(init=False, default=None)
+    on_step: Callable[[], None] | None = field(init=False, default=None)
+    on_update: Callable[[], None] | None = field(init=False, default=None)
+    last_step: Step | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         """Watch the first returns where some of them cannot be represented."""
@@ -109,26 +115,41 @@ class Session:
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
         if isinstance(self.stream, TableWalk):
-            self._count(self.stream.advance(until, request))
+            self._walk(self.stream, until, request)
             return
         stream, experience, learner = self.stream, self.experience, self.learner
         assert self.policy is not None and experience is not None
         device = learner.engine.flat.values.device
         on_cpu = device.type == "cpu"
         while True:
-            step = stream.step(self.policy)
+            step = self.last_step = stream.step(self.policy)
             experience.add(step)
             if self._early is not None:
                 self._early = self._early.add(step)
             self._count(step.episodes)
+            if self.on_step is not None:
+                self.on_step()
             for sample in experience.draw():
                 transition = sample.transition if on_cpu else sample.transition.map(lambda x: x.to(device))
                 # Weights stay on the host: which are 0 is asked there, and learners that multiply by them move them.
                 update = learner.update(transition, sample.weight)
                 experience.return_errors(sample, update.errors)
                 self._last = update, sample
+                if self.on_update is not None:
+                    self.on_update()
             if experience.between_samples and (stream.num_steps >= until or request.name is not None):
                 return
+
+    def _walk(self, walk: TableWalk, until: int, request: StopRequest) -> None:
+        """A walk learns as it goes, so whoever wants to see its steps sees them when they have been learned from."""
+        if self.on_step is None and self.on_update is None:
+            self._count(walk.advance(until, request))
+            return
+        while walk.num_steps < until and request.name is None:
+            self._count(walk.advance(walk.num_steps + 1, request))
+            self.last_step = walk.last_step()
+            for tell in filter(None, (self.on_step, self.on_update)):
+                tell()
 
     def _count(self, episodes: Iterable[Episode]) -> None:
         for episode in episodes:
@@ -142,14 +163,45 @@ class Session:
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed, in the environment's units."""
-        update = None if self._last is None else self._last[0]
-        if isinstance(self.stream, TableWalk):
-            update = self.stream.last_update()
+        update = self.last_update
         if update is None:
             return self._metrics_before
-        seen = self.stream.normalisation
-        scale = self.reward_scale * (1.0 if seen is None else seen.reward_scale)
+        scale = self.value_scale
         return {name: value / (scale * scale if name == "loss" else scale) for name, value in update.metrics().items()}
+
+    @property
+    def value_scale(self) -> float:
+        """By what the learner's values are divided to be in the environment's units."""
+        seen = self.stream.normalisation
+        return self.reward_scale * (1.0 if seen is None else seen.reward_scale)
+
+    @property
+    def last_update(self) -> Update | None:
+        """What the last update saw; of a walk, what the values of the moment say of its last steps."""
+        if isinstance(self.stream, TableWalk):
+            return self.stream.last_update()
+        return None if self._last is None else self._last[0]
+
+    @property
+    def num_updates(self) -> int:
+        """Updates so far."""
+        return self.learner.num_updates
+
+    def values_of(self, observation: Any) -> Array:
+        """Action values of observations in the environment's units, with the parameters that the learner plays with."""
+        stream = self.stream
+        seen = None if stream.normalisation is None else stream.normalisation.frozen()
+        space = stream.envs.action_space if isinstance(stream, TableWalk) else stream.envs.single_action_space
+        _, first_action = discrete_actions(space)
+        agent = Agent(self.learner.engine.q, stream.encoder, stream.spec, first_action, self.value_scale, seen)
+        with evaluating_with(self.learner):
+            return agent.values(observation)
+
+    def parameters(self) -> dict[str, Array]:
+        """Copies of the parameters that the learner plays with, by name."""
+        with evaluating_with(self.learner):
+            named = self.learner.engine.q.state_dict()  # type: ignore[attr-defined]  # a module, as all of ours
+            return {name: value.detach().cpu().numpy().copy() for name, value in named.items()}
 
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""

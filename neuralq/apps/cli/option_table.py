@@ -38,7 +38,7 @@ class TrainOptions:
         run_dir: folder for the run, or None for one of its own.
         tensorboard: whether to write event files.
         wandb: whether to log to Weights & Biases.
-        hook: a hook of the user's own as "module:name", or None.
+        hooks: hooks of the user's own as "module:name".
         seeds: how many seeds to run side by side, or None for one run.
         workers: how many of them at a time, or None for as many as there are cores.
         json: whether to print the result as JSON.
@@ -49,7 +49,7 @@ class TrainOptions:
     run_dir: str | None
     tensorboard: bool
     wandb: bool
-    hook: str | None
+    hooks: tuple[str, ...]
     seeds: int | None
     workers: int | None
     json: bool
@@ -85,7 +85,7 @@ def add_fields(
 
     Example:
         >>> parser = argparse.ArgumentParser()
-        >>> add_fields(parser, TrainOptions, leave_out=("notes",))
+        >>> add_fields(parser, TrainOptions, leave_out=("hooks", "notes"))
         >>> parser.parse_args(["--seeds", "3"]).seeds
         3
     """
@@ -122,7 +122,7 @@ _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
     ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),
     ("workers", int, "N", "how many seeds at a time (default: as many as there are cores)"),
-    ("hook", str, "module:name", "function or class of your own that takes every row of metrics"),
+    ("hook", str, "module:name", "function or class of your own that watches the run (docs/hooks.md); may be repeated"),
 )
 _FLAGS = {
     "print_config": "print the resulting configuration and exit",
@@ -153,7 +153,8 @@ def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParse
         parser.add_argument(f"--{name}", choices=choices, help=f"{text} (default: {default})")
     add_fields(parser, RunConfig, defaults=preset, leave_out=_OWN_PARSING)
     for name, hint, metavar, text in _MORE:
-        parser.add_argument(f"--{name}", type=reader(hint), metavar=metavar, help=text)
+        action = "append" if name == "hook" else "store"
+        parser.add_argument(f"--{name}", action=action, type=reader(hint), metavar=metavar, help=text)
     for name, text in _FLAGS.items():
         parser.add_argument(f"--{name}", action="store_true", help=text)
     kind = LEARNERS[learner]

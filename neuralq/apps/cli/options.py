@@ -109,7 +109,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         run_dir=given.pop("run_dir", None),
         tensorboard=given.pop("tensorboard", False),
         wandb=given.pop("wandb", False),
-        hook=given.pop("hook", None),
+        hooks=tuple(given.pop("hook", ())),
         seeds=given.pop("seeds", None),
         workers=given.pop("workers", None),
         json=given.pop("json", False),

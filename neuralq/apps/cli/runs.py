@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
@@ -45,7 +46,7 @@ def train(argv: list[str]) -> int:
         origin = started_from(config, options)
         probed = "; for a second it is tried how exactly the environment can be resumed" if config.resume_probe else ""
         say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
-        with _hooks(path, config, options.tensorboard, options.wandb, options.hook) as hooks:
+        with _hooks(path, config, options.tensorboard, options.wandb, options.hooks) as hooks:
             run = CONTROL.train(config, path, hooks)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
@@ -68,7 +69,9 @@ def resume(argv: list[str]) -> int:
         "--device", metavar="NAME", default=argparse.SUPPRESS, help="compute elsewhere: cpu, cuda, cuda:1, …"
     )
     parser.add_argument("--workers", type=int, metavar="N", help="of a sweep: how many seeds at a time")
-    parser.add_argument("--hook", metavar="module:name", help="of a run on an environment: as for neuralq train")
+    parser.add_argument(
+        "--hook", action="append", metavar="module:name", help="of a run on an environment: as for neuralq train"
+    )
     add_trust(parser)
     options = parser.parse_args(argv)
     kind = kind_in(options.run)
@@ -78,14 +81,14 @@ def resume(argv: list[str]) -> int:
     changes = {name: getattr(options, name) for name in ("stop_at_return", "device") if hasattr(options, name)}
     if is_sweep_folder(options.run):
         if options.hook is not None:
-            raise Failure("a sweep goes on with the hook that it was begun with; leave --hook out", 2)
+            raise Failure("a sweep goes on with the hooks that it was begun with; leave --hook out", 2)
         return resume_seeds(options.run, total_steps, options.workers, options.json, changes, options.trust)
     if options.workers is not None:
         raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
     path = single_run(options.run, options.trust)
     planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
     board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
-    with _hooks(path, planned, board, tracker, options.hook) as hooks:
+    with _hooks(path, planned, board, tracker, options.hook or ()) as hooks:
         run = CONTROL.resume(path, total_steps, hooks, changes)
     return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
 
@@ -101,17 +104,16 @@ def target(text: str) -> float | None:
 
 
 @contextlib.contextmanager
-def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: str | None) -> Iterator[list[Hook]]:
+def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: Sequence[str]) -> Iterator[list[Hook]]:
     """The hooks of a run, the bar last; closed at the end where they can be."""
     wanted: list[Callable[[], Hook]] = []
     if tensorboard:
         wanted.append(lambda: TensorBoard(path / "tensorboard"))
     if wandb:
         wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
-    if own is not None:
-        wanted.append(lambda: own_hook(own, config))
+    wanted += [functools.partial(own_hook, name, config) for name in own]
     with contextlib.ExitStack() as stack:
-        hooks = []
+        hooks: list[Hook] = []
         for make in wanted:
             hooks.append(make())
             if callable(close := getattr(hooks[-1], "close", None)):
@@ -179,7 +181,8 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
         notes.append(cut)
     status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
-        raise Failure(f"the target of {target:g} was not reached within the budget of {run.env_steps:,} steps", 1)
+        within = "within the budget of" if run.stopped_by is None else f"before {run.stopped_by}, after"
+        raise Failure(f"the target of {target:g} was not reached {within} {run.env_steps:,} steps", 1)
     return status
 
 

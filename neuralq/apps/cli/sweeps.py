@@ -55,9 +55,9 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     """Run seeds side by side; exit status 0 only if each finished and, where a target was set, reached it."""
     assert options.seeds is not None
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
-    if options.hook is not None:
-        own_hook(options.hook, config)  # a name that is wrong is one error, not one for each seed
-        flags += ["--hook", options.hook]
+    for hook in options.hooks:
+        own_hook(hook, config)  # a name that is wrong is one error, not one for each seed
+        flags += ["--hook", hook]
     seeds = range(config.seed, config.seed + options.seeds)
     with claimed(options.run_dir, lambda: _default_path(config)) as path:
         sweep = create_sweep(path, config_to_dict(config), seeds, flags)
@@ -90,7 +90,7 @@ def resume_seeds(
         sweep = open_sweep(path)
         runs = [run for run in map(sweep.run_path, sweep.seeds) if is_run_folder(run)]
         for config in (sweep.config, *map(read_config, runs)):
-            refuse_strangers(config, next((name for name in sweep.options if ":" in name), None))
+            refuse_strangers(config, *(name for name in sweep.options if ":" in name))
     return _run(open_sweep(path, total_steps, changes), num_workers, as_json, "")
 
 
@@ -141,9 +141,9 @@ def _command(sweep: Sweep, seed: int) -> list[str]:
     path = str(sweep.run_path(seed))
     if is_run_folder(path):
         options = list(sweep.options)
-        hook = options[(at := options.index("--hook")) : at + 2] if "--hook" in options else []
+        hooks = options[options.index("--hook") :] if "--hook" in options else []
         told = [f"--{n.replace('_', '-')}={str(value).lower()}" for n, value in _moved(sweep, path).items()]
-        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hook]
+        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hooks]
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
 

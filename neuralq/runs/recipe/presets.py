@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
+from neuralq.runs.recipe.keywords import nested, with_body
 
 __all__ = ["PRESETS", "preset_for", "with_preset"]
 
@@ -224,29 +226,38 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
     return PRESETS.get((env, learner), {})
 
 
-def with_preset(plain: Mapping[str, Any]) -> RunConfig:
+def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
     """The configuration of what is given, over the preset of its environment and learner, over the defaults.
 
     Schedules that are not given end within a ``total_steps`` that is (`neuralq.runs.recipe.budget`).
 
     Args:
-        plain: as `config_to_dict` writes it, or any part of that; settings of the learner may be partial too.
+        given: an environment's id; or as `config_to_dict` writes it, or any part of that; settings of the learner may
+            be partial too.
+        settings: fields of the configuration and, flat, settings of its learner; they win.
 
     Raises:
-        ValueError: for unknown keys and values out of range, as `RunConfig` does.
+        ValueError: for unknown names and values out of range, as `RunConfig` does.
 
     Example:
-        >>> config = with_preset({"env": "CartPole-v1", "rollout": {"num_envs": 8}})
+        >>> config = with_preset("CartPole-v1", num_envs=8)
         >>> config.rollout.num_envs, config.reward_scale
         (8, 0.1)
     """
+    if not isinstance(given, Mapping | str):
+        raise ValueError(
+            f"a preset belongs to the id of an environment, or a mapping that holds it as 'env', got {given!r}; an "
+            "environment itself is taken by neuralq.train"
+        )
+    plain = nested({"env": given} if isinstance(given, str) else given, settings)
     learner = plain.get("learner", RunConfig.learner)
+    check_choice("learner", learner, LEARNERS)
     preset = preset_for(plain.get("env", RunConfig.env), learner)
     if layout_for(learner, plain.get("layout", RunConfig.layout)) not in NETWORKS:
         preset = {name: value for name, value in preset.items() if name != "body"}
     preset, _ = cut_to_budget(preset, plain)
-    given = plain.get(learner) or {}
-    settings = {learner: {**preset.get(learner, {}), **given}}
-    if "target_rule" in given and "num_steps" not in given:  # n was chosen for the preset's rule; others may refuse it
-        settings[learner].pop("num_steps", None)
-    return config_from_dict({**preset, **plain, **settings})
+    given_settings = plain.get(learner) or {}
+    merged = {learner: {**preset.get(learner, {}), **given_settings}}
+    if "target_rule" in given_settings and "num_steps" not in given_settings:
+        merged[learner].pop("num_steps", None)  # n was chosen for the preset's rule; others may refuse it
+    return config_from_dict(with_body({**preset, **plain, **merged}))

@@ -20,7 +20,7 @@ from neuralq.mdp import FiniteMDP
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
 from neuralq.runs.stream.faults import EnvironmentFault, describe_error
-from neuralq.runs.stream.stream import Episode, ObservationSpec
+from neuralq.runs.stream.stream import Episode, ObservationSpec, Step
 from neuralq.runs.stream.vector_env import MASK_METHODS, legal_actions
 from neuralq.tabular.kernels.acting import EPISODE_STEPS, LIMIT, RECORD, REPLAY, STEP, new_log
 from neuralq.tabular.model import Model, compile_model
@@ -61,7 +61,7 @@ class TableWalk:
         self._seed: int | None = seed
         try:
             observation, extras = env.reset(seed=seed)
-            self._first_state = self._read(observation)
+            self._read(observation)
             mask = legal_actions(env, extras)
         except WalkFault as fault:
             raise EnvironmentFault(f"at reset, {fault}") from fault
@@ -80,6 +80,7 @@ class TableWalk:
         self._learner: TabularLearner | None = None
         self._broken = False
         self._return = 0.0
+        self._ended: tuple[Episode, ...] = ()
 
     @property
     def time_limit(self) -> int | None:
@@ -154,7 +155,7 @@ class TableWalk:
             compiled.arrays._replace(reward=compiled.arrays.reward * self._scale), compiled.legal, compiled.max_outcomes
         )
 
-    def advance(self, until: int, request: StopRequest) -> list[Episode]:
+    def advance(self, until: int, request: StopRequest) -> tuple[Episode, ...]:
         """Walk and learn until so many steps were taken in all, or a stop is asked for; the episodes that ended.
 
         Raises:
@@ -168,7 +169,8 @@ class TableWalk:
         while (left := until - self.num_steps) > 0 and request.name is None:
             ended += self._simulate(min(left, _SIMULATED)) if self.simulated else self._step(min(left, _STEPPED))
         self._learner.publish()
-        return [Episode(0, episode_return, length) for episode_return, length in ended]
+        self._ended = tuple(Episode(0, episode_return, length) for episode_return, length in ended)
+        return self._ended
 
     def _step(self, count: int) -> list[tuple[float, int]]:
         assert self._learner is not None
@@ -200,6 +202,13 @@ class TableWalk:
         assert self._learner is not None
         known = self._num_recent if self.simulated else min(self._steps.num_taken, _REMEMBERED)
         return self._learner.errors(self.recent, known) if known else None
+
+    def last_step(self) -> Step:
+        """The step taken last; nobody has computed how probable its action was (NaN)."""
+        log, k = self.recent, 0 if self.simulated else (self.num_steps - 1) % _REMEMBERED
+        s_tm1, a_tm1, r_t, discount_t, s_t, _, last_t = (column[k : k + 1].copy() for column in log[2:])
+        rows = (s_tm1, a_tm1, np.full(1, np.nan, np.float32), r_t / self._scale, discount_t, s_t, last_t)
+        return Step(rows, np.zeros(1, np.int64), self._ended)
 
     @property
     def num_steps(self) -> int:
