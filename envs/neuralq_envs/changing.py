@@ -74,12 +74,7 @@ class ChangingEnv(gymnasium.Env[Any, Any]):
         (180, 39, 184)
     """
 
-    # Whoever would simulate ``mdp()`` in place of the environment can see here that it holds for a time only.
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["ansi", "rgb_array"],
-        "render_fps": 4,
-        "stationary": False,
-    }
+    metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
 
     def __init__(self, before: RenderedEnv, after: RenderedEnv, change_step: int) -> None:
         check_whole("change_step", change_step, minimum=0)

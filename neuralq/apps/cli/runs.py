@@ -11,12 +11,13 @@ from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
-from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started_from, train_seeds
+from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
-from neuralq.runs.control import CONTROL, last_cap
+from neuralq.runs.control import CONTROL, agent_of, last_cap
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
@@ -100,7 +101,7 @@ def target(text: str) -> float | None:
         >>> target("475"), target("none")
         (475.0, None)
     """
-    return None if text.lower() in ("none", "null") else float(text)
+    return None if text.lower() in ("none", "null") else number(text)
 
 
 @contextlib.contextmanager
@@ -130,7 +131,7 @@ def _end(close: Callable[[], object], hook: Hook) -> None:
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play greedy episodes with a run's newest checkpoint, or its best; or a match of backgammon."""
+    """Play greedy episodes with a run's agent, its last parameters or its best; or a match of backgammon."""
     measure = measured_by(argv)
     if measure is not None:
         module, _, function = measure.partition(":")
@@ -138,19 +139,23 @@ def evaluate(argv: list[str]) -> int:
         return status
     parser = command_parser(
         "evaluate",
-        "Play greedy episodes with a trained run. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
+        "Play greedy episodes with the agent of a run: its last parameters, or its best where the run ended well below "
+        "them, which it says. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
         "neuralq evaluate RUN --episodes 100",
         "neuralq evaluate RUN --against gnubg --games 5000",
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add_which(parser)
     add_trust(parser)
     options = parser.parse_args(argv)
-    result = evaluate_run(single_run(options.run, options.trust), options.episodes, options.seed, options.best)
-    named = {"run_dir": str(options.run), "parameters": "best" if options.best else "newest"}
-    print_result({**result.plain(), **named}, options.json, result.lines())
+    path = single_run(options.run, options.trust)
+    result = evaluate_run(path, options.episodes, options.seed, options.best)
+    which = agent_of(path) if options.best is None else "best" if options.best else "final"
+    named = {"run_dir": str(options.run), "parameters": which}
+    played = f"played with the {which} parameters" + (", the agent of the run" if options.best is None else "")
+    print_result({**result.plain(), **named}, options.json, [*result.lines(), played])
     return 0
 
 
@@ -175,7 +180,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
         say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")
     best = _best_return(run)
     notes = []
-    if best is not None and run.greedy_return is not None and best > run.greedy_return:
+    if run.play_off is None and best is not None and run.greedy_return is not None and best > run.greedy_return:
         notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     if (cut := _cut(run)) is not None:
         notes.append(cut)

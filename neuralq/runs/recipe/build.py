@@ -10,6 +10,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
@@ -22,6 +23,7 @@ from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
+from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.env_probe import PROBE_SECONDS, SIMULATED, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
@@ -29,7 +31,7 @@ from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs, make_one
 from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
-from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec
+from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
@@ -154,7 +156,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
-        _value_range(config.settings),
+        _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
 
 
@@ -174,11 +176,22 @@ def _walking_session(config: RunConfig) -> Session:
             stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None),
             SIMULATED if stream.simulated else _probe(config, envs, lambda: make_one(config)),
             config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+            beside=_beside_a_walk(config, envs, stream),
         )  # fmt: skip
     except BaseException:
         with contextlib.suppress(Exception):
             envs.close()
         raise
+
+
+def _beside_a_walk(config: RunConfig, env: gym.Env[Any, Any], stream: TableWalk) -> Beside | None:
+    """The exact answer beside action values; what else is learned on a table aims at something else."""
+    algorithm = config.settings.algorithm
+    if algorithm not in ("td-lambda", "r-learning"):
+        return Beside.of(make_vector_env(lambda: env, 1), stream.spec, config.gamma, config.exact)
+    if config.exact:
+        raise ValueError(f"exact=True compares discounted values of actions, and {algorithm} learns none; leave it out")
+    return None
 
 
 def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:

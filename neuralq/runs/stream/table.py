@@ -6,6 +6,7 @@ the loop, else one step of the environment at a time, without the general stream
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -30,6 +31,7 @@ from neuralq.types import Array
 
 __all__ = ["TableWalk"]
 
+_START = "initial_state_distrib"
 _REMEMBERED = 64
 _SIMULATED, _STEPPED = 1 << 16, 1 << 7  # steps before it is asked whether to stop
 
@@ -95,8 +97,11 @@ class TableWalk:
     def _model(self) -> tuple[FiniteMDP | None, str]:
         """The model, or why there is none."""
         inner = self.envs.unwrapped
-        if (inner.metadata or {}).get("stationary", True) is False:
-            return None, "its model changes with time"
+        made = getattr(inner, "mdp", None)
+        if callable(made) and inspect.signature(made).parameters:
+            return None, "it changes with time, and has no one model"
+        if not callable(made) and getattr(inner, "P", None) is not None and not hasattr(inner, _START):
+            return None, f"its table P does not say where episodes begin ({_START})"
         if not isinstance(self.envs.observation_space, spaces.Discrete):
             return None, "its observations are not numbers, as those of a model are"
         try:
@@ -202,6 +207,13 @@ class TableWalk:
         assert self._learner is not None
         known = self._num_recent if self.simulated else min(self._steps.num_taken, _REMEMBERED)
         return self._learner.errors(self.recent, known) if known else None
+
+    def met(self) -> tuple[Array, Array]:
+        """Every pair that was visited, states as they are seen, with their masks."""
+        assert self._learner is not None
+        s, a = np.nonzero(self._learner.loop.table.visits)
+        legal = self._learner.loop.table.q[s] > -np.inf
+        return (np.concatenate([s[:, None], legal], axis=1) if self.masked else s), a
 
     def last_step(self) -> Step:
         """The step taken last; nobody has computed how probable its action was (NaN)."""
