@@ -61,6 +61,7 @@ def r_learner(table: Table, policy: PolicyLike, step_size: StepCode, beta: float
         ValueError: an argument out of range.
 
     Example:
+        >>> from neuralq.tabular.engine import table_from
         >>> r_learner(table_from([[0.0]]), "greedy", step_code(0.1, 1), 0.01).arguments[1].tolist()
         [0.0, 0.0]
     """

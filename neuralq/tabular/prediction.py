@@ -217,7 +217,7 @@ def td_learner(
         ValueError: an argument out of range.
 
     Example:
-        >>> td_learner(table_from([[0.0]]), step_code(0.1, 1), 0.9, "accumulating", "step").policy.kind == RANDOM
+        >>> td_learner(table_from([[0.0]]), step_code(0.1, 1), 0.9, "accumulating", "step").loop is run_td
         True
     """
     check_choice("kind", kind, KINDS)

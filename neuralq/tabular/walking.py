@@ -160,12 +160,17 @@ class EnvironmentWalk:
             if last:
                 episodes.append((total, length))
                 s, a, length, total = -1, -1, 0, 0.0
-        counters[STATE], counters[ACTION], counters[EPISODE_STEPS] = s, a, length
-        counters[EPISODES] += len(episodes)
         self.running_return, self.num_taken = total, self.num_taken + num_steps
-        if learner.check is not None:
-            learner.check()
+        self._pause(s, a, length, len(episodes))
         return episodes
+
+    def _pause(self, s: int, a: int, length: int, num_episodes: int) -> None:
+        """Writes down where the walk stands."""
+        counters = self._walk.counters
+        counters[STATE], counters[ACTION], counters[EPISODE_STEPS] = s, a, length
+        counters[EPISODES] += num_episodes
+        if self._learner.check is not None:
+            self._learner.check()
 
     def _take(self, a: int) -> tuple[Any, float, bool, bool, Any]:
         """One step of the environment, its reward and its flags looked at."""
