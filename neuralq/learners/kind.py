@@ -116,6 +116,7 @@ class LearnerKind:
         represent: the Q-function that those outputs describe: ``represent(q, settings, reward_scale, rng)``.
         check: ``check(settings, representation)`` raises a `ValueError` with the way out where they do not go together.
         place: where it stands in lists; those of one number by name.
+        step_sizes: settings that a run may go on with otherwise than it began.
     """
 
     name: str
@@ -131,6 +132,7 @@ class LearnerKind:
     represent: Callable[[QFunction, Any, float, np.random.Generator], QFunction] = _as_it_is
     check: Callable[[Any, Representation], None] = _anything
     place: int = 100
+    step_sizes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse experience that no run hands out."""

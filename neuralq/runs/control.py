@@ -22,7 +22,7 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.files import read_rows
 from neuralq.runs.folder.origin import compared
-from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
+from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.recipe.build import (
@@ -32,13 +32,14 @@ from neuralq.runs.recipe.build import (
     normalisation_for,
     plan_of,
 )
-from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.runs.warm_start import begun_from
 
 __all__ = ["CONTROL", "Run", "evaluate_run", "last_cap"]
 
@@ -126,6 +127,10 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
         envs.close()
 
 
+def _newest(run_dir: Path) -> Agent:
+    return _load_agent(run_dir, best=False)
+
+
 def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
     """The flat parameters, and the statistics and the scales through which observations were seen."""
     if best:
@@ -133,7 +138,7 @@ def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
         return kept.parameters, kept.normalisation, kept.scalings
     newest = checkpoint.load_newest(run_dir / "checkpoints")
     saved = newest.state
-    compared(saved.get("origin"), read_config(run_dir), newest.path)
+    compared(saved.get("origin"), read_config(run_dir), newest.path, read_changes(run_dir))
     state = saved["learner"]
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
@@ -196,7 +201,7 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
 _CHANGEABLE = frozenset(
     "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
     "resume_probe".split()
-)
+) | {f"{name}.{setting}" for name, kind in LEARNERS.items() for setting in kind.step_sizes}
 CONTROL = Kind(
     name="control",
     title="a run on an environment",
@@ -213,4 +218,5 @@ CONTROL = Kind(
     notes=_notes,
     changeable=_CHANGEABLE,
     opening=_opening,
+    start=lambda config, session: config if config.warm_start is None else begun_from(config, session, _newest),
 )

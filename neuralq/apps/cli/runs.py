@@ -10,23 +10,24 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, resume_kind, say, train_kind
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run
+from neuralq.runs.changes import told
 from neuralq.runs.control import CONTROL, last_cap
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
+from neuralq.runs.folder.run_folder import claimed, read_changes, read_config, read_metrics, refuse_old_run
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.report import write_report
-from neuralq.runs.sweep import is_sweep_folder
+from neuralq.runs.sweep import is_sweep_folder, open_sweep
 
 __all__ = ["evaluate", "report", "resume", "train"]
 
@@ -72,6 +73,10 @@ def resume(argv: list[str]) -> int:
     parser.add_argument(
         "--hook", action="append", metavar="module:name", help="of a run on an environment: as for neuralq train"
     )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="key=value", dest="changes",
+        help="go on with another value, may be repeated: budget, target, step size, evaluations, checkpoints, device",
+    )  # fmt: skip
     add_trust(parser)
     options = parser.parse_args(argv)
     kind = kind_in(options.run)
@@ -79,6 +84,11 @@ def resume(argv: list[str]) -> int:
         return resume_kind(kind, options)
     total_steps = new_budget(CONTROL, options)
     changes = {name: getattr(options, name) for name in ("stop_at_return", "device") if hasattr(options, name)}
+    asked = changes_of(CONTROL, _stored(options.run), options.changes)
+    if twice := {*changes, *([] if total_steps is None else ["total_steps"])} & set(asked):
+        raise Failure(f"{min(twice)} is given twice, with --set and by its own option; leave one out", 2)
+    total_steps = asked.pop("total_steps", total_steps)
+    changes |= asked
     if is_sweep_folder(options.run):
         if options.hook is not None:
             raise Failure("a sweep goes on with the hooks that it was begun with; leave --hook out", 2)
@@ -91,6 +101,11 @@ def resume(argv: list[str]) -> int:
     with _hooks(path, planned, board, tracker, options.hook or ()) as hooks:
         run = CONTROL.resume(path, total_steps, hooks, changes)
     return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
+
+
+def _stored(path: str) -> RunConfig:
+    """The configuration of a run, or of the seeds of a sweep."""
+    return config_from_dict(open_sweep(path).config if is_sweep_folder(path) else read_config(path))
 
 
 def target(text: str) -> float | None:
@@ -179,6 +194,7 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
         notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     if (cut := _cut(run)) is not None:
         notes.append(cut)
+    notes += [told(row) for row in read_changes(run.run_dir)]
     status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
         within = "within the budget of" if run.stopped_by is None else f"before {run.stopped_by}, after"

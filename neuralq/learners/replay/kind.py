@@ -56,4 +56,5 @@ REPLAY = LearnerKind(
     represent=lambda q, s, reward_scale, rng: s.returns.represent(q, s, reward_scale, rng),
     check=_check,
     place=2,
+    step_sizes=("learning_rate", "dqrc_learning_rate"),
 )
