@@ -100,11 +100,11 @@ def test_another_shape_is_refused_by_its_layer(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for given, said in (
-        ({"body": MLP((5,))}, r"layer trunk.layers.0.weight has the shape \(4, 2\) there and \(5, 2\) here"),
-        ({"body": MLP((4, 4))}, "the layer trunk.layers.2.weight is here and not there"),
+        ({"body": MLP((5,))}, r"layer trunk.layers.0.weight has the shape \(1, 2, 4\) there and \(1, 2, 5\) here"),
+        ({"body": MLP((4,), layer_norm=True)}, "the layer trunk.norms.0.weight is here and not there; take its body"),
         ({"body": MLP((4,), activation="tanh")}, "activation is relu there and tanh here"),
         ({"reward_scale": 0.5}, "reward_scale is 1.0 there and 0.5 here"),
-        ({"env": "CartPole-v1"}, r"layer trunk.layers.0.weight has the shape \(4, 2\) there and \(4, 4\) here"),
+        ({"env": "CartPole-v1"}, r"layer trunk.layers.0.weight has the shape \(1, 2, 4\) there and \(1, 4, 4\) here"),
     ):
         with pytest.raises(ValueError, match=said):
             train(replay(**given), tmp_path / "run", warm_start=source)

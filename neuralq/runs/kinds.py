@@ -93,7 +93,8 @@ class Kind(Generic[C, T, R]):
         build: what trains, freshly made, with compiled kernels warm.
         plan: when a run is evaluated, saved and stopped.
         result: of a run that has ended, which is told by the name it was given; may leave files there.
-        load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
+        load: the agent of a run folder; of the best parameters, if that is asked and they are kept, of the last, or
+            with None of those that the run ended with.
         opening: what is worth saying of a run, once, before it trains; what begins with "warning: " is said to whoever
             listens to nothing else, too.
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
@@ -115,7 +116,7 @@ class Kind(Generic[C, T, R]):
     build: Callable[[C], T]
     plan: Callable[[C], Plan]
     result: Callable[[C, T, Progress, RunFolder], R]
-    load: Callable[[Path, bool], Any]
+    load: Callable[[Path, bool | None], Any]
     notes: Callable[[C, Mapping[str, Any]], list[str]]
     changeable: frozenset[str] = frozenset()
     command: CommandLine | None = None

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,8 @@ import torch
 from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.agent import Agent
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.beside import Beside
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy, play_off
 from neuralq.runs.folder.best import Best
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
@@ -50,6 +52,7 @@ class Session:
         evaluate_every: environment steps between evaluations.
         value_range: the smallest and the largest return that the learner can represent, where it cannot represent all.
         reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
+        beside: holds what is learned against the exact answer, where the environment has a model.
     """
 
     stream: Interaction
@@ -65,6 +68,7 @@ class Session:
     evaluate_every: int
     reward_scale: float = 1.0
     value_range: tuple[float, float] | None = None
+    beside: Beside | None = None
     _evaluation: Interaction | None = field(init=False, default=None)
     _cannot_evaluate: bool = field(init=False, default=False)
     _longest: int = field(init=False, default=0)
@@ -78,7 +82,9 @@ class Session:
     last_step: Step | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        """Watch the first returns where some of them cannot be represented."""
+        """Watch the first returns where some of them cannot be represented, and what is met where that is compared."""
+        if self.beside is not None:
+            self.beside.watch()
         if self.value_range is not None:
             stream = self.stream
             self._early = EarlyReturns(
@@ -114,11 +120,13 @@ class Session:
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
         stream, experience, learner = self.stream, self.experience, self.learner
-        device = learner.engine.flat.values.device
+        device, beside = learner.engine.flat.values.device, self.beside
         on_cpu = device.type == "cpu"
         while True:
             step = self.last_step = stream.step(self.policy)
             experience.add(step)
+            if beside is not None:
+                beside.see(step.rows[0], step.rows[1])
             if self._early is not None:
                 self._early = self._early.add(step)
             for episode in step.episodes:
@@ -186,10 +194,50 @@ class Session:
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""
         with evaluating_with(self.learner):
-            return evaluate_greedy(
-                self.learner.engine.all, self.evaluation_stream, self.evaluation_episodes, seed,
-                self._cap(),
-            )  # fmt: skip
+            return self._play(self.evaluation_episodes, seed)
+
+    def _play(self, num_episodes: int, seed: int) -> Evaluation:
+        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, self._cap())
+
+    @contextlib.contextmanager
+    def playing_with(self, best: Best | None) -> Iterator[None]:
+        """Within the block values are those of other parameters, seen through their statistics; afterwards as before.
+
+        Args:
+            best: whose; None for those that the learner plays with.
+        """
+        flat, seen = self.learner.engine.flat.values, self.stream.normalisation
+        if best is None:
+            with evaluating_with(self.learner):
+                yield
+            return
+        learned, statistics = flat.clone(), None if seen is None else copy.deepcopy(seen.state_dict())
+        flat.copy_(best.parameters)
+        if seen is not None and best.normalisation is not None:
+            seen.load_state_dict(best.normalisation)
+        try:
+            yield
+        finally:
+            flat.copy_(learned)
+            if seen is not None and statistics is not None:
+                seen.load_state_dict(statistics)
+
+    def play_off(self, best: Best, seed: int) -> dict[str, Any]:
+        """The last and the best parameters on the same fresh episodes; the rule is `neuralq.runs.evaluation.play_off`.
+
+        There are up to 100 episodes, and together no more than half the steps of training, in rounds as long as an
+        evaluation; one round there is in any case.
+        """
+
+        def play(which: Best | None, num_episodes: int, at: int) -> Evaluation:
+            with self.playing_with(which):
+                return self._play(num_episodes, at)
+
+        found = play_off(
+            lambda n, at: play(None, n, at), lambda n, at: play(best, n, at), max(2, self.evaluation_episodes),
+            self.env_steps // 2, seed,
+        )  # fmt: skip
+        return {**found, "best_env_steps": best.env_steps}
 
     def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
         """Returns of greedy episodes, and the parameters that played them.
@@ -204,8 +252,18 @@ class Session:
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
+        columns |= self._beside_exact()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def _beside_exact(self) -> dict[str, Any]:
+        """Columns on what is learned beside the exact answer."""
+        if self.beside is None:
+            return {}
+        if (line := self.beside.look()) is not None:
+            self.say(line)
+        with evaluating_with(self.learner):
+            return self.beside.columns(self.learner.engine.all, self.value_scale)
 
     def _cap(self) -> int:
         if self.evaluation_max_steps is not None:
@@ -254,6 +312,7 @@ class Session:
             "stream": self.stream.state_dict(),
             "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
+            "met": None if self.beside is None else self.beside.state_dict(),
         }
 
     def _environments(self) -> dict[str, Any] | None:
@@ -281,6 +340,8 @@ class Session:
         self._metrics_before = progress["last_metrics"]
         self._longest = int(progress.get("longest_episode", 0))
         self.learner.load_state_dict(state["learner"])
+        if self.beside is not None:
+            self.beside.load_state_dict(state.get("met"))
         self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]

@@ -20,6 +20,7 @@ from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.loop import seed_for
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.session import Session
+from neuralq.runs.stream import Normalisation
 
 __all__ = ["begun_from"]
 
@@ -67,9 +68,8 @@ def _mismatch(agent: Agent, there: Any, q: nn.Module, config: RunConfig, session
     theirs = agent.q.state_dict()  # type: ignore[attr-defined]
     for name in dict.fromkeys([*theirs, *mine]):
         if name not in mine or name not in theirs:
-            return (
-                f"the layer {name} is {'there and not here' if name in theirs else 'here and not there'}; take its body"
-            )
+            where = "there and not here" if name in theirs else "here and not there"
+            return f"the layer {name} is {where}; take its body"
         if theirs[name].shape != mine[name].shape:
             shapes = f"{tuple(theirs[name].shape)} there and {tuple(mine[name].shape)} here"
             return f"the layer {name} has the shape {shapes}; take its body, layout and environment"
@@ -77,12 +77,8 @@ def _mismatch(agent: Agent, there: Any, q: nn.Module, config: RunConfig, session
             return f"{name} has other values there than here; take the same settings"
     pairs = {name: (there.get(name), getattr(config, name)) for name in ("layout", "dueling", "reward_scale")}
     pairs["activation"] = _activation(agent.q), _activation(q)
-    seen = [
-        (n is not None and n.observations, n is not None and n.rewards)
-        for n in (agent.normalisation, session.stream.normalisation)
-    ]
-    for i, name in enumerate(("observations", "rewards")):
-        pairs[f"normalised {name}"] = seen[0][i], seen[1][i]
+    ways = [_normalised(agent.normalisation), _normalised(session.stream.normalisation)]
+    pairs |= {name: (ways[0][name], ways[1][name]) for name in ways[0]}
     for name, (other, own) in pairs.items():
         if other != own:
             return f"{name} is {other} there and {own} here; take the same"
@@ -91,6 +87,11 @@ def _mismatch(agent: Agent, there: Any, q: nn.Module, config: RunConfig, session
     except ValueError:
         return "its observations were scaled otherwise; take an environment with the same bounds"
     return None
+
+
+def _normalised(seen: Normalisation | None) -> dict[str, bool]:
+    on = (False, False) if seen is None else (seen.observations, seen.rewards)
+    return dict(zip(("normalised observations", "normalised rewards"), on, strict=True))
 
 
 def _activation(q: Any) -> Any:

@@ -99,4 +99,4 @@ def _copy(parser: argparse.ArgumentParser, to: argparse.ArgumentParser) -> None:
 
 
 def _typed(name: str) -> str:
-    return name if name == "--print_config" else name.rstrip("_").replace("_", "-")
+    return name.rstrip("_").replace("_", "-")

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.apps.cli import DEBUG
-from neuralq.apps.cli.option_values import reader
+from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LAYOUTS, LEARNERS
@@ -21,11 +21,11 @@ __all__ = ["TrainOptions", "add_fields", "train_parser"]
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
   neuralq train CartPole-v1 --seeds 10
-  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
-  neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
-  neuralq train td-gammon --games 100000  (backgammon; has options of its own)
+  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50k
+  neuralq train FrozenLake-v1 --layout table --env-kwargs '{is_slippery: false}'
+  neuralq train td-gammon --games 100k  (backgammon; has options of its own)
   neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
-  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
+  neuralq train CartPole-v1 --print-config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
 
@@ -106,7 +106,7 @@ def add_fields(
 
 
 _MORE: tuple[tuple[str, Any, str, str], ...] = (
-    ("env_kwargs", dict, "MAPPING", "JSON or YAML mapping passed to gymnasium.make"),
+    ("env_kwargs", dict, "MAPPING", ENV_KWARGS),
     (
         "body",
         dict | str | None,
@@ -117,7 +117,7 @@ _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ("hidden", str, "N,N", "widths of the hidden layers, e.g. 64,64"),
     ("layer_norm", bool | None, "{true,false}", "layer normalisation in the network"),
     ("activation", str, "NAME", "relu, tanh or leaky_relu"),
-    ("config", str, "FILE", "YAML file of options, as --print_config writes it"),
+    ("config", str, "FILE", "YAML file of options, as --print-config writes it"),
     ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
     ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
     ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),

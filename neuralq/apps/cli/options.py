@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
-
 from neuralq.apps.cli import Failure
 from neuralq.apps.cli.option_table import TrainOptions, train_parser
 from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
+from neuralq.apps.cli.yaml_text import write_yaml
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
@@ -124,7 +123,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     except ValueError as error:
         raise Failure(str(error), 2) from error
     if printed:
-        print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
+        print(write_yaml(json.loads(json.dumps(config_to_dict(config)))), end="")
         return None
     return config, options
 

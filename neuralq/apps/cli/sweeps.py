@@ -98,6 +98,16 @@ def resume_seeds(
     return _run(open_sweep(path, total_steps, parts), num_workers, as_json, "")
 
 
+def add_which(parser: argparse.ArgumentParser) -> None:
+    """Which of a run's two agents is meant: ``best`` is None where it is left to the run."""
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--best", action="store_true", default=None,
+        help="take the parameters whose evaluation scored highest; default: the agent of the run, which its end names",
+    )  # fmt: skip
+    which.add_argument("--final", action="store_false", dest="best", help="take the last parameters")
+
+
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """The option that keeps modules of strangers from being imported."""
     parser.add_argument(

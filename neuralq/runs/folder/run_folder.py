@@ -63,7 +63,7 @@ __all__ = [
 
 FORMAT_NAME = "neuralq-run"
 FORMAT_VERSION = 1
-_FILES = ("config.json", "versions.json", "run.json", "metrics.jsonl", "summary.json")
+_FILES = ("config.json", "versions.json", "run.json", "metrics.jsonl", "summary.json", "exact.json")
 _FOLDERS = ("checkpoints", "best", "tensorboard", "wandb")
 _LIBRARIES = ("torch", "numpy", "scipy", "gymnasium", "numba", "safetensors")
 

@@ -21,6 +21,7 @@ from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
+from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
@@ -150,7 +151,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
-        _value_range(config.settings),
+        _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
 
 

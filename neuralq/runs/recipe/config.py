@@ -79,6 +79,9 @@ class RunConfig:
         resume_probe: whether it is tried, for a second at most, if the environment's state can be saved and put back.
         checkpoint_every: environment steps between checkpoints.
         log_every: environment steps between rows of training metrics.
+        exact: whether the environment's model is solved and the exact answer shown beside what is learned; None for
+            models that are solved within a second, true for any.
+        monitor: whether the run is watched for divergence.
         engine: "auto", "torch" or "compiled".
         device: "cpu", "cuda", "cuda:1", ….
         threads: CPU threads for linear algebra; small networks are fastest on one.
@@ -115,6 +118,8 @@ class RunConfig:
     resume_probe: bool = True
     checkpoint_every: int = 50_000
     log_every: int = 1024
+    exact: bool | None = None
+    monitor: bool = True
     engine: str = "auto"
     device: str = "cpu"
     threads: int = 1
