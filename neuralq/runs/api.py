@@ -160,12 +160,15 @@ def _passed_on(run: Any) -> Any:
     return run
 
 
-def load(run_dir: str | Path | Run, best: bool = False, *, env: Any = None) -> Any:
-    """The agent of a run's newest checkpoint, or of its best evaluation.
+def load(run_dir: str | Path | Run, best: bool | None = None, *, env: Any = None) -> Any:
+    """The agent of a run: its last parameters, or its best where those are what the run ended with.
+
+    A run that ends below its best evaluation plays both on fresh episodes and keeps the last, unless the best is better
+    by more than the standard error of the difference.
 
     Args:
         run_dir: folder of the run, or the run itself.
-        best: the parameters whose greedy evaluation scored highest, in place of the newest.
+        best: True for the parameters whose greedy evaluation scored highest, False for the last.
         env: the environment, as `train` takes it, of a run in whose folder it has no name that could be followed.
 
     Returns:

@@ -148,7 +148,7 @@ def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParse
     parser.add_argument("--env", type=str, help=argparse.SUPPRESS)
     for name, choices, default, text in (
         ("learner", tuple(LEARNERS), RunConfig.learner, "how to learn"),
-        ("layout", LAYOUTS, RunConfig.layout, "how values are represented"),
+        ("layout", LAYOUTS, LEARNERS[learner].layout, "how values are represented"),
     ):
         parser.add_argument(f"--{name}", choices=choices, help=f"{text} (default: {default})")
     add_fields(parser, RunConfig, defaults=preset, leave_out=_OWN_PARSING)

@@ -18,7 +18,7 @@ from neuralq.apps.cli.yaml_text import write_yaml
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict, layout_for
 from neuralq.runs.recipe.presets import yielding
 
 __all__ = ["parse_train"]
@@ -94,7 +94,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     argv = _with_env_named(hyphenated(argv))
     known, file, rest = _peek(argv)
     preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
-    if known.layout not in NETWORKS:  # a preset's body is for networks
+    if layout_for(known.learner, str(known.layout)) not in NETWORKS:  # a preset's body is for networks
         preset = {name: value for name, value in preset.items() if name != "body"}
     has_preset = bool(preset)
     if {"-h", "--help"} & set(rest):

@@ -90,4 +90,5 @@ REPLAY = LearnerKind(
     represent=_represented,
     check=_check,
     place=2,
+    step_sizes=("learning_rate", "dqrc_learning_rate"),
 )

@@ -8,7 +8,7 @@ from typing import Any
 from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
 from neuralq.runs.recipe.keywords import nested, with_body
 
 __all__ = ["PRESETS", "preset_for", "with_preset", "yielding"]
@@ -273,7 +273,7 @@ def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
     learner = plain.get("learner", RunConfig.learner)
     check_choice("learner", learner, LEARNERS)
     preset = preset_for(plain.get("env", RunConfig.env), learner)
-    if plain.get("layout", RunConfig.layout) not in NETWORKS:
+    if layout_for(learner, plain.get("layout", RunConfig.layout)) not in NETWORKS:
         preset = {name: value for name, value in preset.items() if name != "body"}
     preset, _ = cut_to_budget(preset, plain)
     given_settings = plain.get(learner) or {}
