@@ -120,6 +120,7 @@ class LearnerKind:
         check: ``check(settings, representation)`` raises a `ValueError` with the way out where they do not go together.
         layout: of the representation where none is chosen.
         place: where it stands in lists; those of one number by name.
+        step_sizes: settings that a run may go on with otherwise than it began.
     """
 
     name: str
@@ -136,6 +137,7 @@ class LearnerKind:
     check: Callable[[Any, Representation], None] = _anything
     layout: str = "action-output"
     place: int = 100
+    step_sizes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse experience that no run hands out."""

@@ -23,7 +23,7 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.files import plain_values, read_rows, to_json, write_durably
 from neuralq.runs.folder.origin import compared
-from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
+from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.recipe.build import (
@@ -33,13 +33,14 @@ from neuralq.runs.recipe.build import (
     normalisation_for,
     plan_of,
 )
-from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.runs.warm_start import begun_from
 
 __all__ = ["CONTROL", "Run", "agent_of", "evaluate_run", "last_cap"]
 
@@ -197,12 +198,16 @@ def _kept(run_dir: Path, best: bool | None) -> tuple[Tensor, Any, Any]:
             raise checkpoint.CheckpointError(f"{error}; these are the run's agent, --final takes the last") from error
         return kept.parameters, kept.normalisation, kept.scalings
     saved = newest.state
-    compared(saved.get("origin"), read_config(run_dir), newest.path)
+    compared(saved.get("origin"), read_config(run_dir), newest.path, read_changes(run_dir))
     state = saved["learner"]
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
         parameters = state["average"]["values"]
     return torch.as_tensor(parameters), saved["stream"].get("normalisation"), saved["stream"].get("scalings")
+
+
+def _chosen(run_dir: Path) -> Agent:
+    return _load_agent(run_dir, None)
 
 
 def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool | None = None) -> Evaluation:
@@ -269,7 +274,7 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
 _CHANGEABLE = frozenset(
     "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
     "resume_probe exact monitor".split()
-)
+) | {f"{name}.{setting}" for name, kind in LEARNERS.items() for setting in kind.step_sizes}
 CONTROL = Kind(
     name="control",
     title="a run on an environment",
@@ -286,4 +291,5 @@ CONTROL = Kind(
     notes=_notes,
     changeable=_CHANGEABLE,
     opening=_opening,
+    start=lambda config, session: config if config.warm_start is None else begun_from(config, session, _chosen),
 )

@@ -19,6 +19,7 @@ from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict, layout_for
+from neuralq.runs.recipe.presets import yielding
 
 __all__ = ["parse_train"]
 
@@ -149,7 +150,9 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
     for layer in layers:
         if not isinstance(layer, dict):
             raise Failure(f"{learner} must be a mapping, got {layer!r}", 2)
-    values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    own, *others = layers
+    given_settings = {name: value for layer in others for name, value in layer.items()}
+    values[learner] = {**yielding(own, given_settings), **given_settings}
     if "hidden" in short:
         try:
             short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]

@@ -102,6 +102,7 @@ class RunConfig:
         engine: "auto", "torch" or "compiled".
         device: "cpu", "cuda", "cuda:1", ….
         threads: CPU threads for linear algebra; small networks are fastest on one.
+        warm_start: run folder with whose weights, and statistics of observations, the run begins; None for new ones.
     """
 
     env: str = "CartPole-v1"
@@ -140,9 +141,12 @@ class RunConfig:
     engine: str = "auto"
     device: str = "cpu"
     threads: int = 1
+    warm_start: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse values outside their range and settings that would be ignored; fill in the learner's defaults."""
+        if self.warm_start is not None:  # a run itself will do
+            object.__setattr__(self, "warm_start", str(getattr(self.warm_start, "run_dir", self.warm_start)))
         for name, value in _fitted(
             "", {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}, RunConfig
         ).items():

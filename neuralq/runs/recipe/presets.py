@@ -11,7 +11,7 @@ from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
 from neuralq.runs.recipe.keywords import nested, with_body
 
-__all__ = ["PRESETS", "preset_for", "with_preset"]
+__all__ = ["PRESETS", "preset_for", "with_preset", "yielding"]
 
 _GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 _MINATAR: dict[str, Any] = {
@@ -214,6 +214,15 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 
+_YIELDS = {
+    "target_rule": ("num_steps",),  # n was chosen for the preset's rule; others may refuse it
+    "block_length": ("num_steps", "target_rule"),
+    "target_rate": ("target_period_updates",),
+    "target_period_updates": ("target_rate",),
+}
+"""What of a preset gives way to a setting that is given."""
+
+
 def preset_for(env: str, learner: str) -> dict[str, Any]:
     """The preset's values, empty where there is none.
 
@@ -224,6 +233,17 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
         {}
     """
     return PRESETS.get((env, learner), {})
+
+
+def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a preset's settings of a learner can stand beside those that are given.
+
+    Example:
+        >>> yielding({"target_period_updates": 250, "learning_rate": 1e-3}, {"target_rate": 0.01})
+        {'learning_rate': 0.001}
+    """
+    gone = {over for name, overs in _YIELDS.items() if name in given for over in overs}
+    return {name: value for name, value in settings.items() if name not in gone}
 
 
 def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
@@ -257,7 +277,5 @@ def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
         preset = {name: value for name, value in preset.items() if name != "body"}
     preset, _ = cut_to_budget(preset, plain)
     given_settings = plain.get(learner) or {}
-    merged = {learner: {**preset.get(learner, {}), **given_settings}}
-    if "target_rule" in given_settings and "num_steps" not in given_settings:
-        merged[learner].pop("num_steps", None)  # n was chosen for the preset's rule; others may refuse it
+    merged = {learner: {**yielding(preset.get(learner, {}), given_settings), **given_settings}}
     return config_from_dict(with_body({**preset, **plain, **merged}))
