@@ -1,4 +1,4 @@
-"""Gymnasium's Blackjack (``sab=True``, its registered form) as arithmetic on cards: the optimum, and any policy's value.
+"""Gymnasium's Blackjack (``sab=True``, as registered) as arithmetic on cards: the optimum, and any policy's value.
 
 Cards are drawn with replacement: 1 … 9 with probability 1/13 each, 10 with 4/13. The dealer draws up to 17 or more. A
 natural (ace and ten) wins against any hand of the dealer's but another natural.
@@ -25,7 +25,7 @@ def with_card(hand: Hand, card: int) -> Hand:
 @functools.cache
 def dealer(hand: Hand, num_cards: int) -> dict[tuple[int, bool], float]:
     """How probable each score of the dealer's is (0: too much), and whether it is a natural."""
-    total, soft = hand
+    total = hand[0]
     if num_cards >= 2 and total >= 17:
         return {(total if total <= 21 else 0, num_cards == 2 and total == 21): 1.0}
     found: dict[tuple[int, bool], float] = {}

@@ -147,6 +147,16 @@ class TabularSettings:
             )
 
     @property
+    def acts(self) -> bool:
+        """Whether what is learned says what to do; the values of states do not."""
+        return self.algorithm != "td-lambda"
+
+    @property
+    def discounts(self) -> bool:
+        """Whether discounted values of actions are learned, those that have an exact answer beside them in runs."""
+        return self.algorithm not in ("td-lambda", "r-learning")
+
+    @property
     def plan(self) -> dict[str, Any]:
         """Every setting with its value, those that nobody set with their defaults.
 
