@@ -6,6 +6,7 @@ at all.
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
@@ -165,3 +166,31 @@ def test_how_many_environments_were_made_is_told_where_that_may_be_the_reason(
     assert isinstance(raised.value, error) == (stops_at < 3) and len(closed) == made
     notes = getattr(raised.value, "__notes__", [])
     assert [] == notes if note is None else note in notes[0]
+
+
+@pytest.mark.parametrize("reward", ["1.0", b"1.0", np.str_("1"), np.array("1.0"), np.array(b"1")], ids=repr)
+def test_the_text_of_a_number_is_no_reward(monkeypatch: pytest.MonkeyPatch, reward: Any) -> None:
+    stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+    monkeypatch.setattr(Failing, "step", lambda self, action: (np.zeros(1), reward, False, False, {}))
+    with pytest.raises(EnvironmentFault, match=r"environment 0: reward must be a number, got .*1"):
+        stream.step(lambda s: push(s, np.random.default_rng(0)))
+    for batch in ([reward, 1.0], np.array(["1.0", "2.0"]), np.array([1.0, reward], dtype=object)):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        found = (np.zeros((2, 1)), batch, np.zeros(2, bool), np.zeros(2, bool), {})
+        with monkeypatch.context() as patched, pytest.raises(EnvironmentFault, match="field reward: must be numbers"):
+            patched.setattr(stream.envs, "step", lambda actions, found=found: found)
+            stream.step(lambda s: push(s, np.random.default_rng(0)))
+
+
+def test_numbers_of_every_kind_are_rewards(monkeypatch: pytest.MonkeyPatch) -> None:
+    for reward in (1, True, np.float32(1), np.int8(1), np.array(1.0), torch.tensor(1.0), Fraction(1)):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        with monkeypatch.context() as patched:
+            patched.setattr(Failing, "step", lambda self, action, r=reward: (np.zeros(1), r, False, False, {}))
+            assert stream.step(lambda s: push(s, np.random.default_rng(0))).rows[3].tolist() == [1.0, 1.0]
+    for batch in ([1, 2.0], (np.float32(1), Fraction(2)), np.array([1, 2], np.int8), torch.tensor([1.0, 2.0])):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        found = (np.zeros((2, 1)), batch, np.zeros(2, bool), np.zeros(2, bool), {})
+        with monkeypatch.context() as patched:
+            patched.setattr(stream.envs, "step", lambda actions, found=found: found)
+            assert stream.step(lambda s: push(s, np.random.default_rng(0))).rows[3].tolist() == [1.0, 2.0]
