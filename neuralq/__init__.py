@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from neuralq.runs import load as load
     from neuralq.runs import report as report
     from neuralq.runs import resume as resume
+    from neuralq.runs import solve as solve
     from neuralq.runs import train as train
     from neuralq.runs import with_preset as with_preset
     from neuralq.types import QFunction as QFunction
@@ -56,6 +57,7 @@ __all__ = [
     "report",
     "resume",
     "rules",
+    "solve",
     "tabular",
     "train",
     "with_preset",
@@ -77,6 +79,7 @@ _HOMES = {
     "Transition": "neuralq.types",
     "load": "neuralq.runs",
     "resume": "neuralq.runs",
+    "solve": "neuralq.runs",
     "train": "neuralq.runs",
     "with_preset": "neuralq.runs",
 }

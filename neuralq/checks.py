@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "ELSEWHERE",
     "MOST_WHOLE",
     "MissingExtra",
     "available_bytes",
@@ -24,6 +26,9 @@ __all__ = [
 
 MOST_WHOLE = 2**128
 """Whole numbers stay below this: seeds of 128 bits are the longest that anybody draws."""
+
+ELSEWHERE = "neuralq runs on Linux and macOS (it needs file locks as they have them); on Windows install it in WSL 2"
+"""What is said where the standard library has no ``fcntl``."""
 
 
 class MissingExtra(ImportError):
@@ -87,7 +92,8 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     """
     if type(value) is int and abs(value) >= MOST_WHOLE:  # beyond any use, and 10^309 is beyond any float
         raise ValueError(f"{name} must be a whole number below 2^128, got one of {value.bit_length():,} bits")
-    if isinstance(value, bool) or not math.isfinite(value) or int(value) != value or value < minimum:
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or int(value) != value or value < minimum:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 
 

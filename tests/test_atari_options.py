@@ -14,7 +14,8 @@ import pytest
 from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
 from neuralq.runs import RunConfig
-from neuralq.runs.recipe.build import build_session, make_envs
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.recipe.games import make_single
 from neuralq.runs.stream import Interaction
 

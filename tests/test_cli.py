@@ -1,7 +1,7 @@
 """The command line: what it prints, what it refuses and with which exit status.
 
 Mutants that must die here: the configuration file winning over the command line · a preset winning over either ·
---print_config without the environment · unknown keys passed over · settings of another learner ignored · status 0 for
+--print-config without the environment · unknown keys passed over · settings of another learner ignored · status 0 for
 a target that was not reached · anything after the JSON object on standard output · a seed that is not used.
 """
 
@@ -21,7 +21,7 @@ import pytest
 import yaml
 from gymnasium import spaces
 
-from neuralq.apps.cli import COMMANDS, main, options
+from neuralq.apps.cli import COMMANDS, main, option_table
 from neuralq.learners import learner_kinds
 from neuralq.runs import RunConfig
 from neuralq.runs.folder.run_folder import read_config
@@ -56,8 +56,8 @@ def refusal(capsys: Capture, argv: list[str], status: int) -> str:
 
 
 def configuration(capsys: Capture, argv: list[str]) -> dict[str, Any]:
-    """What --print_config prints."""
-    assert run(["train", *argv, "--print_config"]) == 0
+    """What --print-config prints."""
+    assert run(["train", *argv, "--print-config"]) == 0
     loaded: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
     return loaded
 
@@ -242,7 +242,7 @@ def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> N
         ("replay: {capacity: 500}", "settings for the replay learner would be ignored"),
         (
             "learner: sarsa",
-            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', got 'sarsa'",
+            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', 'tabular', got 'sarsa'",
         ),
         ("learner: [rollout]", "learner must be text, got ['rollout']"),
         ("total_steps: many", "total_steps must be a whole number, got 'many'"),
@@ -387,7 +387,7 @@ def test_counts_out_of_range_are_refused(trained: Path, capsys: Capture) -> None
     assert "seed" in refusal(capsys, ["evaluate", str(trained), "--seed", "-1"], 1)
     assert "total_steps" in refusal(capsys, ["resume", str(trained), "--total-steps", "0"], 1)
     assert run(["solve", "FrozenLake-v1", "--env-kwargs", "{x"]) == 2
-    assert "is no JSON" in capsys.readouterr().err
+    assert "--env-kwargs: must be a mapping, got {x" in capsys.readouterr().err
 
 
 def test_tensorboard_files_are_written_and_continued(tmp_path: Path, capsys: Capture) -> None:
@@ -420,8 +420,8 @@ def test_the_help_of_settings_is_read_from_docstrings_of_every_version_of_python
     wanted = {"first": "what is said on two lines.", "second": "the other."}
     # As compiled up to 3.12, from 3.13 on, and under -OO: by itself, and as a dataclass fills it in.
     for doc, found in ((text, wanted), (inspect.cleandoc(text), wanted), (None, {}), ("Some(first: int)", {})):
-        assert options._field_help(type("Some", (), {"__doc__": doc})) == found
-    assert {f.name for f in dataclasses.fields(RunConfig)} <= options._field_help(
+        assert option_table._field_help(type("Some", (), {"__doc__": doc})) == found
+    assert {f.name for f in dataclasses.fields(RunConfig)} <= option_table._field_help(
         RunConfig
     ).keys() | learner_kinds().keys()
 
@@ -432,3 +432,13 @@ def test_commands_run_without_docstrings_and_assertions(tmp_path: Path) -> None:
     for argv in (["train", "--help"], ["train", "--learner", "replay", "--help"], words, ["evaluate", words[-1]]):
         done = subprocess.run([sys.executable, "-OO", "-m", "neuralq", *argv], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
+
+
+def test_where_there_are_no_file_locks_it_is_said_in_one_line() -> None:
+    """As on Windows."""
+    code = "import sys; sys.modules['fcntl'] = None\nfrom neuralq.apps.cli import main\nsys.exit(main(['presets']))"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and "WSL 2" in ended.stderr
+    code = "import sys; sys.modules['fcntl'] = None\nfrom neuralq import train"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.stderr.strip().splitlines()[-1].startswith("ImportError: neuralq runs on Linux and macOS")

@@ -30,7 +30,8 @@ from neuralq.learners import RolloutSettings
 from neuralq.runs import RunConfig, evaluate_run, load, resume, train
 from neuralq.runs.folder.env_probe import is_resumable, untried
 from neuralq.runs.folder.run_folder import read_metrics
-from neuralq.runs.recipe.build import build_session, make_envs
+from neuralq.runs.recipe.build import build_session
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.session import cap_on_evaluation
 from neuralq.runs.stream import EnvironmentFault, Interaction
 

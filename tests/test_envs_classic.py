@@ -29,7 +29,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 import neuralq_envs
 from neuralq.runs import RunConfig
 from neuralq.runs.folder.env_probe import is_resumable
-from neuralq.runs.recipe.build import make_envs
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.stream import Interaction
 from neuralq_envs import vector_twin
 from neuralq_envs.classic import ClassicVectorEnv, make_acrobot_vector, make_mountain_car_vector

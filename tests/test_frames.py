@@ -23,8 +23,9 @@ from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.frames import channels_first
 from neuralq.q.single_row import SingleRowNetwork
 from neuralq.runs import RunConfig, train, with_preset
-from neuralq.runs.recipe.build import build_q, build_session, make_envs
+from neuralq.runs.recipe.build import build_q, build_session
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.recipe.games import make_single
 from neuralq.runs.stream import Interaction, make_vector_env
 from neuralq.runs.stream.encoding import encoder_for

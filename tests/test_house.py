@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from neuralq import RunConfig
-from neuralq.runs.recipe.build import make_envs
+from neuralq.runs.recipe.environments import make_envs
 
 ROOT = Path(__file__).parents[1]
 LIBRARY = sorted([*(ROOT / "neuralq").rglob("*.py"), *(ROOT / "envs").rglob("*.py")])
@@ -286,7 +286,7 @@ def in_a_fresh_process(program: str) -> str:
         "import neuralq_envs, gymnasium; neuralq_envs.register(); gymnasium.make('neuralq/MitchellGrid-v0').reset()",
         "import gymnasium, neuralq_envs; gymnasium.make_vec('neuralq/MitchellGrid-v0', num_envs=2).reset(seed=0)",
         "import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0",
-        "from neuralq.runs.recipe.build import make_envs; import neuralq; "
+        "from neuralq.runs.recipe.environments import make_envs; import neuralq; "
         "make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()",
     ],
 )

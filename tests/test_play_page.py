@@ -258,6 +258,14 @@ def test_the_phone_by_day_and_by_night(browser: Any, table: str) -> None:
         assert spots(page, "target")
         box = page.locator("#confirm").bounding_box()
         assert box["y"] + box["height"] < 740  # board, status and buttons fit one screen
+        assert page.locator(".checker .disc").first.bounding_box()["width"] > 33  # px; 23 on a board that lies
+        first, last = (page.locator(f'.spot[data-spot="{spot}"]').bounding_box() for spot in ("12", "1"))
+        assert first["y"] < last["y"] and first["x"] == pytest.approx(last["x"])  # it stands, home is below
+        discs, targets = page.locator(".checker .disc").count(), spots(page, "target")
+        page.set_viewport_size({"width": 740, "height": 375})  # the phone is turned: the same board lies
+        wait_until(lambda: page.get_attribute("#board", "viewBox") == "0 0 702 580")
+        assert page.locator(".checker .disc").count() == discs and spots(page, "target") == targets
+        page.set_viewport_size(PHONE)
         papers = set()
         for scheme in ("light", "dark"):
             page.emulate_media(color_scheme=scheme)
@@ -304,7 +312,9 @@ def test_tic_tac_toe_to_its_end(browser: Any) -> None:
     with served(tictactoe()) as address, opened(browser, viewport=PHONE) as page:
         page.goto(f"{address}?seed=1")
         wait_until(lambda: revision(page) > 0)
-        assert page.locator(".value.draw").count() == 9  # every opening draws
+        assert page.locator(".value").count() == 0  # nobody is told before he asks
+        page.keyboard.press("h")
+        assert page.locator(".worth-draw .value.draw").count() == 9  # every opening draws
         assert page.evaluate("document.documentElement.scrollWidth") == 375
         page.keyboard.press("ArrowRight")  # the middle takes the focus
         page.keyboard.press("ArrowUp")

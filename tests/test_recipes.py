@@ -18,8 +18,9 @@ import pytest
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP, ActionInputQ, ActionOutputQ, Conv, LinearQ, SeparateQ, TableQ
 from neuralq.runs import RunConfig, preset_for, train, with_preset
-from neuralq.runs.recipe.build import build_q, build_session, make_envs, plan_of
+from neuralq.runs.recipe.build import build_q, build_session, plan_of
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
+from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.recipe.presets import PRESETS
 
 CONFIGS = [

@@ -92,6 +92,20 @@ def test_the_star_turns_under_the_keyboard(page: Any, address: str) -> None:
 
 
 @pytest.mark.slow
+def test_the_star_is_drawn_so_that_one_sees_it(page: Any, address: str) -> None:
+    """ρ = 1.0024 is on the circle unless one looks closely, and six of Baird's weights are one line."""
+    page.goto(address)
+    expect(page, VERDICT, "diverges")
+    page.wait_for_selector("#weights svg.main-svg")
+    assert page.is_checked("#closeup")
+    assert page.get_attribute("#weights", "aria-label").endswith("lines: w1–w6; w7; w8")
+    page.uncheck("#closeup")
+    page.locator("#gamma").press("ArrowLeft")
+    wait_until(page, "document.querySelector('#verdict-number').textContent !== 'ρ = 1.002393'")
+    assert not page.is_checked("#closeup")  # the visitor has decided
+
+
+@pytest.mark.slow
 def test_problem_and_method_change(page: Any, address: str) -> None:
     page.goto(address)
     expect(page, VERDICT, "diverges")
@@ -112,6 +126,8 @@ def test_a_remedy_can_be_tried_at_once(page: Any, address: str) -> None:
     expect(page, VERDICT, "diverges")
     page.click("#find-help")
     expect(page, "#help-status", "remedies")
+    heads = page.locator("#help thead th").all_text_contents()
+    assert heads[:2] == ["Change", "Converges"] and page.locator("#help tbody tr").count() >= 5
     page.locator("#help button").first.click()
     expect(page, VERDICT, "converges")
 

@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,9 @@ from neuralq.exact.undiscounted import (
     resting_rows,
 )
 from neuralq.mdp import FiniteMDP
+
+if TYPE_CHECKING:
+    import gymnasium
 
 __all__ = ["METHODS", "Solution", "count_optimal_policies", "optimal_policies", "solve"]
 
@@ -94,7 +98,7 @@ class Solution:
 
 
 def solve(
-    mdp: FiniteMDP,
+    mdp: FiniteMDP | gymnasium.Env[Any, Any],
     gamma: float,
     method: str = "auto",
     tol: float | None = None,
@@ -105,7 +109,7 @@ def solve(
     """The optimal values and every optimal action of a model, within a guaranteed bound.
 
     Args:
-        mdp: the model.
+        mdp: the model, or an environment that has one (`FiniteMDP.from_gymnasium`).
         gamma: γ in [0, 1]. With 1 episodes must end: ``"auto"`` and ``"policy-iteration"`` need a policy that ends them
             from every state, and one that never does must earn less; other methods need that every policy ends them.
             Where no end can be reached, but one can rest at reward 0 and earn nothing, V* is 0 (an absorbing goal).
@@ -138,6 +142,7 @@ def solve(
     if max_iterations is not None:
         check_whole("max_iterations", max_iterations)
     began = time.perf_counter()
+    mdp = _model(mdp)
     problem = prepare(mdp, gamma)
     tol = tol or default_tolerance(problem)
     resting = resting_rows(problem) if math.isinf(problem.reach) else np.empty(0, dtype=np.int64)
@@ -148,6 +153,18 @@ def solve(
     chosen = _automatic(problem) if method == "auto" else method
     limit = math.inf if max_iterations is None else max_iterations
     return _solved(problem, chosen, tol, limit, seed, began)
+
+
+def _model(given: FiniteMDP | gymnasium.Env[Any, Any]) -> FiniteMDP:
+    """A model, or the one inside an environment."""
+    if isinstance(given, FiniteMDP):
+        return given
+    if not hasattr(given, "unwrapped"):
+        raise ValueError(
+            f"an exact answer needs a FiniteMDP, or an environment that has a table, got {given!r}; neuralq.solve "
+            "takes names of environments, too"
+        )
+    return FiniteMDP.from_gymnasium(given)
 
 
 def _solved(problem: PlanningProblem, chosen: str, tol: float, limit: float, seed: int, began: float) -> Solution:

@@ -32,7 +32,7 @@ class DuelingQ(nn.Module):
     mean is over all actions, also those that a mask forbids in some state.
 
     Args:
-        input_shape: shape of one observation (after ``features``, if given).
+        input_shape: shape of one observation (after ``features``, if given), or the length of a vector.
         num_actions: A.
         body: `MLP`, `Conv` or `Custom` with at least one hidden layer.
         features: module without parameters applied to the observation first.
@@ -54,7 +54,7 @@ class DuelingQ(nn.Module):
 
     def __init__(
         self,
-        input_shape: tuple[int, ...],
+        input_shape: tuple[int, ...] | int,
         num_actions: int,
         body: Body | None = None,
         features: nn.Module | None = None,

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -9,7 +13,30 @@ from torch import Tensor, nn
 from neuralq.checks import check_whole
 from neuralq.types import Array
 
-__all__ = ["OneHot", "Pixels"]
+__all__ = ["OneHot", "Pixels", "shape_of"]
+
+
+def shape_of(given: Any) -> tuple[int, ...]:
+    """The shape of an observation, of which a vector's may be given as its length.
+
+    Raises:
+        ValueError: for anything else, with what a Gymnasium space has for it.
+
+    Example:
+        >>> shape_of(4), shape_of((84, 84, 4))
+        ((4,), (84, 84, 4))
+    """
+    sides = given if isinstance(given, Iterable) else (given,)
+    try:
+        found = tuple(operator.index(side) for side in sides)
+    except TypeError:
+        found = (0,)
+    if any(side < 1 for side in found):
+        raise ValueError(
+            f"input_shape must be the length of a vector or a tuple of whole numbers of at least 1, got {given!r}; a "
+            "Gymnasium Box has it as its shape, and a Discrete goes to TableQ(space.n, num_actions)"
+        )
+    return found
 
 
 class OneHot(nn.Module):

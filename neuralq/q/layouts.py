@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from neuralq.checks import check_whole
 from neuralq.q.bodies import MLP
 from neuralq.q.custom import Body
+from neuralq.q.inputs import shape_of
 
 __all__ = ["ActionInputQ", "ActionOutputQ", "SeparateQ"]
 
@@ -25,7 +26,7 @@ class _Input(nn.Module):
 
     def __init__(
         self,
-        input_shape: tuple[int, ...],
+        input_shape: tuple[int, ...] | int,
         body: Body,
         copies: int,
         features: nn.Module | None,
@@ -33,7 +34,7 @@ class _Input(nn.Module):
         dtype: torch.dtype,
     ) -> None:
         super().__init__()
-        self.input_shape = tuple(input_shape)
+        self.input_shape = shape_of(input_shape)
         self.copies = copies
         self.features = features
         self.dtype = dtype
@@ -61,7 +62,7 @@ class ActionOutputQ(nn.Module):
     """State in, one output per action: the layout of DQN and of Mitchell's third network.
 
     Args:
-        input_shape: shape of one observation (after ``features``, if given).
+        input_shape: shape of one observation (after ``features``, if given), or the length of a vector.
         num_actions: A.
         body: `MLP`, `Conv`, or a module of your own (`Custom`).
         features: module without parameters applied to the observation first (one-hot, pixel scaling).
@@ -69,14 +70,14 @@ class ActionOutputQ(nn.Module):
         dtype: float32 by default.
 
     Example:
-        >>> q = ActionOutputQ((4,), num_actions=2, body=MLP(hidden=(8,)), rng=0)
+        >>> q = ActionOutputQ(4, num_actions=2, body=MLP(hidden=(8,)), rng=0)
         >>> q.all(torch.zeros(3, 4)).shape
         torch.Size([3, 2])
     """
 
     def __init__(
         self,
-        input_shape: tuple[int, ...],
+        input_shape: tuple[int, ...] | int,
         num_actions: int,
         body: Body | None = None,
         features: nn.Module | None = None,
@@ -114,7 +115,7 @@ class SeparateQ(nn.Module):
 
     def __init__(
         self,
-        input_shape: tuple[int, ...],
+        input_shape: tuple[int, ...] | int,
         num_actions: int,
         body: Body | None = None,
         features: nn.Module | None = None,
@@ -153,7 +154,7 @@ class ActionInputQ(nn.Module):
 
     def __init__(
         self,
-        input_shape: tuple[int, ...],
+        input_shape: tuple[int, ...] | int,
         num_actions: int,
         body: Body | None = None,
         features: nn.Module | None = None,

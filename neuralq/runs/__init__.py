@@ -15,14 +15,16 @@ if TYPE_CHECKING:
     from neuralq.runs.recipe.config import RunConfig as RunConfig
     from neuralq.runs.recipe.presets import preset_for as preset_for
     from neuralq.runs.recipe.presets import with_preset as with_preset
+    from neuralq.runs.solving import solve as solve
 
-__all__ = ["Run", "RunConfig", "evaluate_run", "load", "preset_for", "resume", "train", "with_preset"]
+__all__ = ["Run", "RunConfig", "evaluate_run", "load", "preset_for", "resume", "solve", "train", "with_preset"]
 
 _HOMES = {
     **dict.fromkeys(("load", "resume", "train"), "neuralq.runs.api"),
     **dict.fromkeys(("Run", "evaluate_run"), "neuralq.runs.control"),
     "RunConfig": "neuralq.runs.recipe.config",
     **dict.fromkeys(("preset_for", "with_preset"), "neuralq.runs.recipe.presets"),
+    "solve": "neuralq.runs.solving",
 }
 
 if not TYPE_CHECKING:  # a type checker would believe that every name exists

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 from neuralq.checks import MissingExtra, check_module_name
 from neuralq.runs.folder.files import write_durably
+from neuralq.runs.watching import EVENTS, Hook
 
 __all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
 
@@ -44,8 +45,8 @@ class TensorBoard:
         self._writer.close()
 
 
-def own_hook(name: str, config: Any = None) -> Callable[[Mapping[str, Any]], None]:
-    """A hook of the user's own: a function that takes a row of metrics, or a class whose instances do.
+def own_hook(name: str, config: Any = None) -> Hook:
+    """A hook of the user's own: a function that takes a row of metrics, or a class whose instances are hooks.
 
     Args:
         name: "package.module:name", imported as environments and bodies of one's own are. A class is called without
@@ -56,8 +57,8 @@ def own_hook(name: str, config: Any = None) -> Callable[[Mapping[str, Any]], Non
         ValueError: if there is nothing of that name, or it cannot be made or called.
 
     Example:
-        >>> own_hook("builtins:print")({"kind": "train", "env_steps": 64})
-        {'kind': 'train', 'env_steps': 64}
+        >>> own_hook("builtins:print") is print
+        True
     """
     place, _, attribute = name.partition(":")
     if attribute:
@@ -76,9 +77,12 @@ def own_hook(name: str, config: Any = None) -> Callable[[Mapping[str, Any]], Non
             hook = found.of(config) if hasattr(found, "of") else found()
         except (Exception, SystemExit) as error:
             raise ValueError(f"cannot make the hook {name!r}: it raised {type(error).__name__}: {error}") from error
-    if not callable(hook):
-        raise ValueError(f"the hook {name!r} must take a row of metrics when called, got {hook!r}")
-    return cast(Callable[[Mapping[str, Any]], None], hook)
+    if not callable(hook) and not any(callable(getattr(hook, event, None)) for event in EVENTS):
+        raise ValueError(
+            f"the hook {name!r} must take a row of metrics when called, got {hook!r}, which has none of "
+            f"{', '.join(EVENTS)} either"
+        )
+    return cast(Hook, hook)
 
 
 class WeightsAndBiases:

@@ -6,22 +6,22 @@ its `Progress`; a checkpoint holds exactly the first and the last, so a run that
 
 from __future__ import annotations
 
-import logging
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from neuralq.learners.learner import Learner
 from neuralq.runs.folder import checkpoint, origin
-from neuralq.runs.folder.best import Best, keep_best
-from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
+from neuralq.runs.folder.best import Best, keep_best, load_best
+from neuralq.runs.folder.checkpoint import CheckpointError
+from neuralq.runs.folder.run_folder import RunFolder, read_changes, warn_of_lost_rows
 from neuralq.runs.stop_request import StopAsked, StopRequest
 from neuralq.runs.stream.experience import Sample
+from neuralq.runs.watching import Hook, HookFault, Listener, Observer, Watch, say_to
 
 __all__ = [
     "NOT_EXACT",
@@ -31,6 +31,7 @@ __all__ = [
     "Listener",
     "Observer",
     "Plan",
+    "PlaysOff",
     "Progress",
     "Speaks",
     "Trainee",
@@ -44,39 +45,6 @@ __all__ = [
 NOT_EXACT = "the run goes on from the state that was saved, but not with the same bits for certain"
 
 
-class Hook(Protocol):
-    """Takes every row of metrics (``kind`` "train" or "evaluation") as it is recorded. Hooks read, never write."""
-
-    def __call__(self, row: Mapping[str, Any], /) -> None:
-        """Take in one row."""
-        ...
-
-
-@runtime_checkable
-class Observer(Protocol):
-    """A hook that also looks at the learner: what was last learned from is shown to it before each row.
-
-    It reads, never writes: neither the learner nor the sample, of which it copies what it wants to keep.
-    """
-
-    def observe(self, learner: Learner, sample: Sample, /) -> None:
-        """Read the learner and the sample it last learned from."""
-        ...
-
-    def __call__(self, row: Mapping[str, Any], /) -> None:
-        """Take in one row."""
-        ...
-
-
-@runtime_checkable
-class Listener(Protocol):
-    """A hook that is also told, in a line each, what is worth knowing of a run before it begins."""
-
-    def say(self, line: str, /) -> None:
-        """Take in one line."""
-        ...
-
-
 @runtime_checkable
 class Speaks(Protocol):
     """A trainee that may have something to say while it trains; it is given ``say``."""
@@ -84,21 +52,17 @@ class Speaks(Protocol):
     say: Callable[[str], None]
 
 
-def say_to(hooks: Sequence[Hook], line: str) -> None:
-    """A line to every hook that listens; a warning that nobody listens to goes to the log ``neuralq``."""
-    listeners = [hook for hook in hooks if isinstance(hook, Listener)]
-    for listener in listeners:
-        listener.say(line)
-    if not listeners and line.startswith("warning: "):
-        logging.getLogger("neuralq").warning(line.removeprefix("warning: "))
-
-
-class HookFault(RuntimeError):
-    """A hook raised; the run was saved where it stood."""
-
-
 class Diverged(RuntimeError):
     """The parameters are no longer finite numbers; the last checkpoint is from before that."""
+
+
+@runtime_checkable
+class PlaysOff(Protocol):
+    """A trainee whose last parameters can be held against its best."""
+
+    def play_off(self, best: Best, seed: int) -> dict[str, Any]:
+        """Which of both is the agent of the run ("agent": "final" or "best"), and what that was decided by."""
+        ...
 
 
 class Trainee(Protocol):
@@ -195,7 +159,11 @@ class Progress:
         reached_at: amount at which ``stop_at_return`` was first met.
         finished: whether the run has ended by itself.
         interrupted_by: name of the signal that ended it early.
+        stopped_by: which hook ended it early, and why.
         moved: what decides the arithmetic and was not the same all along, in words.
+        hook_states: what hooks have to remember, by name.
+        agent: of a finished run that ended below its best evaluation: which of both is its agent, and by what that was
+            decided (`PlaysOff`); None where the last parameters are.
     """
 
     cpu_seconds: float = 0.0
@@ -209,7 +177,10 @@ class Progress:
     next_checkpoint: int = 0
     next_log: int = 0
     interrupted_by: str | None = None
+    stopped_by: str | None = None
     moved: str | None = None
+    hook_states: dict[str, Any] = field(default_factory=dict)
+    agent: dict[str, Any] | None = None
 
 
 def seed_for(seed: int, *purpose: int) -> int:
@@ -235,41 +206,49 @@ def continued(trainee: Trainee, folder: RunFolder) -> Progress:
         return Progress()
     saved = checkpoint.load_newest(folder.checkpoints_path)
     state = saved.state
-    moved = origin.compared(state.get("origin"), folder.config, saved.path)
+    moved = origin.compared(state.get("origin"), folder.config, saved.path, read_changes(folder.path))
     trainee.load_state_dict(state)
     folder.truncate_metrics(trainee.env_steps)
     warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))
     known = {f.name for f in fields(Progress)}
     progress = Progress(**{name: value for name, value in state["progress"].items() if name in known})
+    progress.hook_states = dict(state.get("hooks", {}))
     if moved is not None:
         progress.moved = moved if progress.moved is None else f"{progress.moved}; {moved}"
         warnings.warn(f"{NOT_EXACT}: {moved}", stacklevel=2)
     return progress
 
 
-def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = ()) -> None:
-    """Train until the plan is met, the budget is spent or a signal asks to stop; the folder then holds a checkpoint.
+def fit(
+    trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook] = (), config: Any = None
+) -> None:
+    """Train until the plan is met, the budget is spent, or a hook or a signal asks to stop; then there is a checkpoint.
 
     Args:
         trainee: what trains; changed in place.
         plan: when to evaluate, save and stop.
         progress: where to begin; changed in place.
         folder: an open run folder.
-        hooks: called with each row of metrics.
+        hooks: called with each row of metrics, and shown what they ask for.
+        config: of the run, for hooks.
 
     Raises:
         EnvironmentFault: if an environment breaks its contract. The last checkpoint stays as it is.
         Diverged: if the parameters stop being finite. Likewise.
         HookFault: if a hook raises, once the run is saved.
     """
-    loop = _Loop(trainee, plan, progress, folder, hooks)
     request = StopRequest()
+    watch = Watch(hooks, trainee, progress, folder, config, request)
+    watch.restore()
+    loop = _Loop(trainee, plan, progress, folder, watch)
     with request.listening():
         try:
-            loop.run(request)
-        except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
-            loop._book(training=False)
-            loop.interrupted(request)
+            try:
+                loop.run(request)
+            except StopAsked:  # an evaluation is abandoned; it is due again when the run goes on
+                loop._book(training=False)
+                loop.interrupted(request)
+            loop.ended()
         except HookFault as fault:
             loop._save(request)
             raise HookFault(
@@ -281,21 +260,11 @@ def fit(trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hoo
             raise
 
 
-def _told_of(hook: Hook, error: Exception) -> str:
-    """Which hook, what it raised, and where in its code."""
-    name = getattr(hook, "__qualname__", type(hook).__qualname__)
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
-    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"the hook {name} raised {type(error).__name__}: {error}{place}"
-
-
 class _Loop:
-    def __init__(
-        self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]
-    ) -> None:
-        self.trainee, self.plan, self.progress, self.folder, self.hooks = trainee, plan, progress, folder, hooks
+    def __init__(self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, watch: Watch) -> None:
+        self.trainee, self.plan, self.progress, self.folder, self.watch = trainee, plan, progress, folder, watch
         progress.finished = False
-        progress.interrupted_by = None
+        progress.interrupted_by = progress.stopped_by = progress.agent = None
         progress.next_evaluation = progress.next_evaluation or plan.evaluate_every
         progress.next_checkpoint = progress.next_checkpoint or plan.checkpoint_every
         if plan.log_whole_periods:
@@ -311,6 +280,7 @@ class _Loop:
         while not reached and trainee.amount < plan.budget:
             next_look = min(progress.next_log, progress.next_evaluation, progress.next_checkpoint, plan.budget)
             trainee.advance(next_look, request)
+            self.watch.require_sound()
             amount = trainee.amount
             if amount >= progress.next_log or (plan.log_whole_periods and amount >= plan.budget):
                 self._log()
@@ -319,6 +289,9 @@ class _Loop:
                 reached = plan.stop_at_return is not None and progress.reached_at is not None
             if reached:
                 break
+            if request.by_hook:  # nothing is abandoned: the run ends here as it would at its budget
+                progress.stopped_by = self.watch.stopped_by if amount < plan.budget else None
+                break
             if request.name is not None:
                 self.interrupted(request)
                 return
@@ -326,8 +299,36 @@ class _Loop:
                 self._save(request)
         if progress.evaluated_at != trainee.amount:
             self._evaluate(request)
+        self._choose_agent(request)
         progress.finished = True
         self._save(request)
+
+    def ended(self) -> None:
+        """Tell the hooks, once all is saved."""
+        progress = self.progress
+        reached = self.plan.stop_at_return is not None and progress.reached_at is not None
+        self.watch.ended_by = progress.interrupted_by or progress.stopped_by or ("target" if reached else "budget")
+        self.watch.call("on_end")
+
+    def _choose_agent(self, request: StopRequest) -> None:
+        """Where the last evaluation was not the best, both play on, and the better is the agent of the run."""
+        trainee, progress = self.trainee, self.progress
+        last, best = progress.greedy_return, progress.best_return
+        if last is None or best is None or last >= best or not isinstance(trainee, PlaysOff):
+            return
+        try:
+            kept = load_best(self.folder.path)
+        except CheckpointError:  # deleted meanwhile
+            return
+        self._book()
+        try:
+            with request.abandoning():
+                progress.agent = trainee.play_off(kept, seed_for(self.plan.seed, 12, trainee.amount))
+        except KeyboardInterrupt:  # asked twice, as in an evaluation
+            self._book(training=False)
+            self.interrupted(request)
+            raise
+        self._book(training=False)
 
     def interrupted(self, request: StopRequest) -> None:
         self.progress.interrupted_by = request.name
@@ -355,14 +356,9 @@ class _Loop:
             **columns,
         }
         self.folder.append_metrics(row)
-        observed = trainee.observed
-        for hook in self.hooks:
-            try:
-                if observed is not None and isinstance(hook, Observer):
-                    hook.observe(*observed)
-                hook(row)
-            except Exception as error:
-                raise HookFault(_told_of(hook, error)) from error
+        self.watch.row(row)
+        if kind == "evaluation":
+            self.watch.call("on_evaluation")
         self._book(training=False)  # whoever watches costs wall time only
 
     def _log(self) -> None:
@@ -405,13 +401,17 @@ class _Loop:
     def _save(self, request: StopRequest) -> None:
         with request.saving():
             self._checkpoint()
+        self.watch.require_sound()
 
     def _checkpoint(self) -> None:
         self.progress.next_checkpoint = self._after(self.plan.checkpoint_every)
         self.trainee.require_finite()
         self._book()
         state = self.trainee.state_dict()
-        state["progress"] |= {name: value for name, value in asdict(self.progress).items() if value is not None}
+        known = {f.name: getattr(self.progress, f.name) for f in fields(self.progress) if f.name != "hook_states"}
+        state["progress"] |= {name: value for name, value in known.items() if value is not None}
         state["progress"]["num_rows"] = self.folder.num_rows
+        if hooks := self.watch.states():
+            state["hooks"] = hooks
         state["origin"] = self._origin()
         checkpoint.save(self.folder.checkpoints_path, self.trainee.env_steps, state)

@@ -10,6 +10,7 @@ from types import FrameType
 __all__ = ["StopAsked", "StopRequest", "pass_on", "raise_if_asked"]
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
+_FROM_A_HOOK = "a hook"
 _listening: list[StopRequest] = []
 _abandonable: list[StopRequest] = []
 
@@ -35,8 +36,17 @@ class StopRequest:
         self._impatient = False
         self._saving = False
 
+    @property
+    def by_hook(self) -> bool:
+        """Whether it was a hook that asked, and no signal since."""
+        return self.name == _FROM_A_HOOK
+
+    def ask(self) -> None:
+        """Ask as a hook does: what goes on comes back where it can be saved."""
+        self.name = self.name or _FROM_A_HOOK
+
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.name is None:
+        if self.name is None or self.by_hook:
             self.name = signal.Signals(number).name
         elif self._saving:
             self._impatient = True
@@ -96,7 +106,7 @@ def raise_if_asked() -> None:
     Example:
         >>> raise_if_asked()  # nobody has
     """
-    if _abandonable and _abandonable[-1].name is not None:
+    if _abandonable and _abandonable[-1].name is not None and not _abandonable[-1].by_hook:
         raise StopAsked
 
 

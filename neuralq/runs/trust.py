@@ -16,12 +16,12 @@ from typing import Any
 __all__ = ["refuse_strangers"]
 
 
-def refuse_strangers(config: Mapping[str, Any], hook: str | None = None) -> None:
+def refuse_strangers(config: Mapping[str, Any], *hooks: str) -> None:
     """Nothing where every module that a configuration names belongs to an installed package; nothing is imported.
 
     Args:
         config: of a run, as ``config.json`` holds it.
-        hook: "module:name" of a hook, if there is one.
+        hooks: "module:name" of each hook.
 
     Raises:
         ValueError: for a module that does not, naming it.
@@ -32,7 +32,7 @@ def refuse_strangers(config: Mapping[str, Any], hook: str | None = None) -> None
         Traceback (most recent call last):
         ValueError: the run imports the module my_game (its environment), which is no installed package; ...
     """
-    for what, module in _named(config, hook):
+    for what, module in _named(config, hooks):
         if not _is_installed(module.partition(".")[0]):
             raise ValueError(
                 f"the run imports the module {module} (its {what}), which is no installed package; read it, and if you "
@@ -40,11 +40,12 @@ def refuse_strangers(config: Mapping[str, Any], hook: str | None = None) -> None
             )
 
 
-def _named(config: Mapping[str, Any], hook: str | None) -> list[tuple[str, str]]:
+def _named(config: Mapping[str, Any], hooks: Sequence[str]) -> list[tuple[str, str]]:
     """What is imported for which part; whatever is no text is refused elsewhere."""
     body = config.get("body")
     named = {"environment": config.get("env"), "body": body.get("module") if isinstance(body, Mapping) else body}
-    found = [(what, name) for what, name in {**named, "hook": hook}.items() if isinstance(name, str)]
+    parts = [*named.items(), *(("hook", hook) for hook in hooks)]
+    found = [(what, name) for what, name in parts if isinstance(name, str)]
     return [(what, name.partition(":")[0]) for what, name in found if ":" in name]
 
 

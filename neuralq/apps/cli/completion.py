@@ -57,7 +57,7 @@ def _everything() -> argparse.ArgumentParser:
 
 def _add_train(to: argparse.ArgumentParser) -> None:
     """The options of every learner; a run takes those of its own."""
-    from neuralq.apps.cli.options import train_parser
+    from neuralq.apps.cli.option_table import train_parser
     from neuralq.runs.kinds import KINDS
     from neuralq.runs.recipe.config import LEARNERS
 
@@ -99,4 +99,4 @@ def _copy(parser: argparse.ArgumentParser, to: argparse.ArgumentParser) -> None:
 
 
 def _typed(name: str) -> str:
-    return name if name == "--print_config" else name.rstrip("_").replace("_", "-")
+    return name.rstrip("_").replace("_", "-")

@@ -3,162 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import difflib
-import inspect
 import itertools
 import json
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
-from pathlib import Path
-from types import MappingProxyType
-from typing import Any, get_args, get_origin, get_type_hints
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
 
-import yaml  # type: ignore[import-untyped]
-
-from neuralq.apps.cli import DEBUG, Failure
-from neuralq.apps.cli.yaml_text import read_yaml
+from neuralq.apps.cli import Failure
+from neuralq.apps.cli.option_table import TrainOptions, train_parser
+from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
+from neuralq.apps.cli.yaml_text import write_yaml
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig, preset_for
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import (
-    LAYOUTS,
-    LEARNERS,
-    NETWORKS,
-    body_to_dict,
-    config_from_dict,
-    config_to_dict,
-    fitted_value,
-)
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict, layout_for
+from neuralq.runs.recipe.presets import yielding
 
-__all__ = [
-    "TrainOptions",
-    "add_fields",
-    "as_typed",
-    "hyphenated",
-    "parse_train",
-    "read_config_file",
-    "read_options",
-    "train_parser",
-]
+__all__ = ["parse_train"]
 
-_EXAMPLES = """examples:
-  neuralq train CartPole-v1 --seed 3 --stop-at-return 475
-  neuralq train CartPole-v1 --seeds 10
-  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
-  neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
-  neuralq train td-gammon --games 100000  (backgammon; has options of its own)
-  neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
-  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
-
-_OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
 _MOST_SEEDS = 10_000
 _WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "print_config"}
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """What was asked for on the command line, beside the configuration of the run.
-
-    Args:
-        run_dir: folder for the run, or None for one of its own.
-        tensorboard: whether to write event files.
-        wandb: whether to log to Weights & Biases.
-        hook: a hook of the user's own as "module:name", or None.
-        seeds: how many seeds to run side by side, or None for one run.
-        workers: how many of them at a time, or None for as many as there are cores.
-        json: whether to print the result as JSON.
-        preset: whether a preset gave defaults.
-        notes: what was made of schedules that the budget would not have let finish.
-    """
-
-    run_dir: str | None
-    tensorboard: bool
-    wandb: bool
-    hook: str | None
-    seeds: int | None
-    workers: int | None
-    json: bool
-    preset: bool
-    notes: tuple[str, ...]
-
-
-def hyphenated(argv: Sequence[str]) -> list[str]:
-    """``--stop-at-return`` and ``--rollout.lambda`` as the names of their fields; values are left alone.
-
-    Example:
-        >>> hyphenated(["--stop-at-return=475", "--rollout.lambda", "-1"])
-        ['--stop_at_return=475', '--rollout.lambda_', '-1']
-    """
-    out = []
-    for token in argv:
-        match = re.fullmatch(r"--([A-Za-z][\w.-]*)(=.*)?", token, re.DOTALL)
-        if match is None:
-            out.append(token)
-            continue
-        name = re.sub(r"(^|\.)lambda$", r"\1lambda_", match[1].replace("-", "_"))
-        out.append(f"--{name}{match[2] or ''}")
-    return out
-
-
-def as_typed(text: str) -> str:
-    """Option names in a text of the parser's, with hyphens.
-
-    Example:
-        >>> as_typed("--lambda_ and --step_size")
-        '--lambda and --step-size'
-    """
-    return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text).replace(
-        "--print-config", "--print_config"
-    )
-
-
-def _reader(hint: Any) -> Callable[[str], Any]:
-    """What reads an option's text as the kind of value that its field holds."""
-
-    def read(text: str) -> Any:
-        value: Any = text
-        if hint is not str:
-            try:
-                value = read_yaml(text)
-            except yaml.YAMLError:
-                pass  # a word that is no YAML is what it is
-            except ValueError as error:
-                raise argparse.ArgumentTypeError(f"cannot be read: {error}") from error
-            with contextlib.suppress(ValueError):  # YAML 1.1 takes 1e-5 for a word
-                value = float(text) if isinstance(value, str) else value
-        try:
-            return fitted_value("", value, hint, text)
-        except ValueError as error:
-            if str in get_args(hint):
-                return text
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    return read
-
-
-def read_options(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
-    """What was given, by name, settings of a learner as a mapping.
-
-    Raises:
-        Failure: for wrong usage, in one line instead of all the options, with exit status 2.
-    """
-    hint = f"; `{parser.prog} --help` lists the options"
-    try:
-        found, unknown = parser.parse_known_args(list(argv))
-    except argparse.ArgumentError as error:
-        said, name = " ".join(error.message.split()), error.argument_name
-        if name is not None:
-            said = f"{name} {said}" if said.startswith("must ") else f"{name}: {said}"
-        raise Failure(as_typed(said) + hint, 2) from error
-    if unknown:
-        raise Failure(as_typed(f"unrecognized arguments: {' '.join(unknown)}") + hint, 2)
-    given: dict[str, Any] = {}
-    for name, value in vars(found).items():
-        place, _, field = name.rpartition(".")
-        (given.setdefault(place, {}) if place else given)[field] = value
-    return given
 
 
 def _with_env_named(argv: Sequence[str]) -> list[str]:
@@ -196,32 +62,6 @@ def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list
     return known, file, rest
 
 
-def read_config_file(path: str) -> dict[str, Any]:
-    """The mapping in a file of options, JSON or YAML.
-
-    Raises:
-        Failure: if it cannot be read or holds something else, with exit status 2.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        try:
-            content = json.loads(text, object_pairs_hook=_once)  # YAML 1.1 takes 1e-05 for a word
-        except (ValueError, RecursionError):
-            content = read_yaml(text)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
-    content = {} if content is None else content
-    if not isinstance(content, dict):
-        raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
-    return content
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(found := dict(pairs)) < len(pairs):
-        raise ValueError("a key is given twice")
-    return found
-
-
 def _read_file(path: str) -> dict[str, Any]:
     content = read_config_file(path)
     known = [f.name for f in fields(RunConfig)]
@@ -245,111 +85,6 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
             )
 
 
-def _field_help(settings: type) -> dict[str, str]:
-    """What each field of a dataclass is for, read from its docstring, so that it is written once."""
-    # Python 3.13 takes the indentation away when it compiles, and `python -OO` the docstring.
-    text = inspect.cleandoc(settings.__doc__ or "")
-    block = re.split(r"\n\w+:", text.partition("Args:")[2])[0]
-    return {m[1]: " ".join(m[2].split()) for m in re.finditer(r"\n {4}(\w+): (.*?)(?=\n {4}\w+:|\Z)", block, re.DOTALL)}
-
-
-def add_fields(
-    parser: Any,
-    settings: type[Any],
-    prefix: str = "",
-    defaults: Mapping[str, Any] = MappingProxyType({}),
-    short: Mapping[str, str] = MappingProxyType({}),
-    leave_out: Collection[str] = (),
-) -> None:
-    """An option for each field of a dataclass, with its type, its default and what its docstring says of it.
-
-    Args:
-        parser: takes the options.
-        settings: the dataclass.
-        prefix: before the name of each option.
-        defaults: those that are not the dataclass's own.
-        short: options that are named otherwise than their fields, by field.
-        leave_out: fields that have no option.
-
-    Example:
-        >>> parser = argparse.ArgumentParser()
-        >>> add_fields(parser, TrainOptions, leave_out=("notes",))
-        >>> parser.parse_args(["--seeds", "3"]).seeds
-        3
-    """
-    texts, types = _field_help(settings), get_type_hints(settings)
-    for f in fields(settings):
-        if f.name in leave_out:
-            continue
-        default, hint = defaults.get(f.name, f.default), types[f.name]
-        more: dict[str, Any] = {"type": _reader(hint)}
-        if get_origin(hint) is tuple:
-            more, default = {"type": _reader(get_args(hint)[0]), "nargs": "+"}, " ".join(map(str, default))
-        words = {int: "N", float: "X", str: "NAME", bool: "{true,false}"}
-        kind = next((k for k in (hint, *get_args(hint)) if k in words), str)
-        shown = "" if default is MISSING else f" (default: {'none' if default is None else default})"
-        text = f"{texts.get(f.name, f.name.replace('_', ' ')).rstrip('.')}{shown}".replace("%", "%%")
-        option = f"--{prefix}{short.get(f.name, f.name)}"
-        parser.add_argument(option, dest=prefix + f.name, metavar=words[kind], help=text, **more)
-
-
-_MORE: tuple[tuple[str, Any, str, str], ...] = (
-    ("env_kwargs", dict, "MAPPING", "JSON or YAML mapping passed to gymnasium.make"),
-    (
-        "body",
-        dict | str | None,
-        "NAME",
-        f"network body: {', '.join(NAMED_BODIES)}, module:Class of your own, or a mapping: "
-        "'{class: MLP, hidden: [64]}'",
-    ),
-    ("hidden", str, "N,N", "widths of the hidden layers, e.g. 64,64"),
-    ("layer_norm", bool | None, "{true,false}", "layer normalisation in the network"),
-    ("activation", str, "NAME", "relu, tanh or leaky_relu"),
-    ("config", str, "FILE", "YAML file of options, as --print_config writes it"),
-    ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
-    ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
-    ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),
-    ("workers", int, "N", "how many seeds at a time (default: as many as there are cores)"),
-    ("hook", str, "module:name", "function or class of your own that takes every row of metrics"),
-)
-_FLAGS = {
-    "print_config": "print the resulting configuration and exit",
-    "tensorboard": "write TensorBoard event files (extra tensorboard)",
-    "wandb": "log to Weights & Biases (extra wandb)",
-    "json": "print the result as one JSON object on the last line",
-    "debug": DEBUG,
-}
-
-
-def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParser:
-    """The parser of a run by ``learner``; the preset's values stand in the help, and what is not given is left out."""
-    parser = argparse.ArgumentParser(
-        prog="neuralq train",
-        usage="neuralq train ENV [options]",
-        description="Train on a Gymnasium environment by TD(λ). ENV is a registered id, or module:id for your own.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-        exit_on_error=False,
-        argument_default=argparse.SUPPRESS,
-    )
-    parser.add_argument("--env", type=str, help=argparse.SUPPRESS)
-    for name, choices, default, text in (
-        ("learner", tuple(LEARNERS), RunConfig.learner, "how to learn"),
-        ("layout", LAYOUTS, RunConfig.layout, "how values are represented"),
-    ):
-        parser.add_argument(f"--{name}", choices=choices, help=f"{text} (default: {default})")
-    add_fields(parser, RunConfig, defaults=preset, leave_out=_OWN_PARSING)
-    for name, hint, metavar, text in _MORE:
-        parser.add_argument(f"--{name}", type=_reader(hint), metavar=metavar, help=text)
-    for name, text in _FLAGS.items():
-        parser.add_argument(f"--{name}", action="store_true", help=text)
-    kind = LEARNERS[learner]
-    group = parser.add_argument_group(f"options of the {learner} learner", f"{kind.title}: {kind.source}")
-    add_fields(group, kind.settings, f"{learner}.", preset.get(learner, {}))
-    return parser
-
-
 def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     """The configuration asked for and the other options; None where printing the options or that was all.
 
@@ -359,7 +94,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     argv = _with_env_named(hyphenated(argv))
     known, file, rest = _peek(argv)
     preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
-    if known.layout not in NETWORKS:  # a preset's body is for networks
+    if layout_for(known.learner, str(known.layout)) not in NETWORKS:  # a preset's body is for networks
         preset = {name: value for name, value in preset.items() if name != "body"}
     has_preset = bool(preset)
     if {"-h", "--help"} & set(rest):
@@ -374,7 +109,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         run_dir=given.pop("run_dir", None),
         tensorboard=given.pop("tensorboard", False),
         wandb=given.pop("wandb", False),
-        hook=given.pop("hook", None),
+        hooks=tuple(given.pop("hook", ())),
         seeds=given.pop("seeds", None),
         workers=given.pop("workers", None),
         json=given.pop("json", False),
@@ -389,7 +124,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     except ValueError as error:
         raise Failure(str(error), 2) from error
     if printed:
-        print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
+        print(write_yaml(json.loads(json.dumps(config_to_dict(config)))), end="")
         return None
     return config, options
 
@@ -415,7 +150,9 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
     for layer in layers:
         if not isinstance(layer, dict):
             raise Failure(f"{learner} must be a mapping, got {layer!r}", 2)
-    values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    own, *others = layers
+    given_settings = {name: value for layer in others for name, value in layer.items()}
+    values[learner] = {**yielding(own, given_settings), **given_settings}
     if "hidden" in short:
         try:
             short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]

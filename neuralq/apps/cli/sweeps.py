@@ -14,15 +14,17 @@ from typing import Any, TextIO
 
 from neuralq.apps.cli import Failure, main, print_result
 from neuralq.apps.cli.kinds import say
-from neuralq.apps.cli.options import TrainOptions
+from neuralq.apps.cli.option_table import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
 from neuralq.runs.children import python_command
+from neuralq.runs.control import CONTROL
 from neuralq.runs.evaluation import shown
+from neuralq.runs.folder.origin import flat_names
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
-from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.sweep import (
     Status,
     Sweep,
@@ -55,9 +57,9 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     """Run seeds side by side; exit status 0 only if each finished and, where a target was set, reached it."""
     assert options.seeds is not None
     flags = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
-    if options.hook is not None:
-        own_hook(options.hook, config)  # a name that is wrong is one error, not one for each seed
-        flags += ["--hook", options.hook]
+    for hook in options.hooks:
+        own_hook(hook, config)  # a name that is wrong is one error, not one for each seed
+        flags += ["--hook", hook]
     seeds = range(config.seed, config.seed + options.seeds)
     with claimed(options.run_dir, lambda: _default_path(config)) as path:
         sweep = create_sweep(path, config_to_dict(config), seeds, flags)
@@ -90,8 +92,20 @@ def resume_seeds(
         sweep = open_sweep(path)
         runs = [run for run in map(sweep.run_path, sweep.seeds) if is_run_folder(run)]
         for config in (sweep.config, *map(read_config, runs)):
-            refuse_strangers(config, next((name for name in sweep.options if ":" in name), None))
-    return _run(open_sweep(path, total_steps, changes), num_workers, as_json, "")
+            refuse_strangers(config, *(name for name in sweep.options if ":" in name))
+    plain = config_to_dict(CONTROL.changed(config_from_dict(open_sweep(path).config), None, changes))
+    parts = {name.partition(".")[0]: plain[name.partition(".")[0]] for name in changes}
+    return _run(open_sweep(path, total_steps, parts), num_workers, as_json, "")
+
+
+def add_which(parser: argparse.ArgumentParser) -> None:
+    """Which of a run's two agents is meant: ``best`` is None where it is left to the run."""
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--best", action="store_true", default=None,
+        help="take the parameters whose evaluation scored highest; default: the agent of the run, which its end names",
+    )  # fmt: skip
+    which.add_argument("--final", action="store_false", dest="best", help="take the last parameters")
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
@@ -141,9 +155,9 @@ def _command(sweep: Sweep, seed: int) -> list[str]:
     path = str(sweep.run_path(seed))
     if is_run_folder(path):
         options = list(sweep.options)
-        hook = options[(at := options.index("--hook")) : at + 2] if "--hook" in options else []
-        told = [f"--{n.replace('_', '-')}={str(value).lower()}" for n, value in _moved(sweep, path).items()]
-        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hook]
+        hooks = options[options.index("--hook") :] if "--hook" in options else []
+        told = [f"--set={name}={'none' if value is None else value}" for name, value in _moved(sweep, path).items()]
+        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hooks]
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
 
@@ -154,8 +168,9 @@ def _moved(sweep: Sweep, run: str) -> dict[str, Any]:
         began = read_config(run)
     except RunFolderError:  # its process will say so
         return {}
-    names = [name for name in ("stop_at_return", "device") if name in sweep.config and name in began]
-    return {name: sweep.config[name] for name in names if sweep.config[name] != began[name]}
+    wanted, began = flat_names(sweep.config), flat_names(began)
+    names = [name for name in sorted(CONTROL.may_change() - {CONTROL.budget}) if name in wanted and name in began]
+    return {name: wanted[name] for name in names if wanted[name] != began[name]}
 
 
 def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:

@@ -101,9 +101,12 @@ def _prescribe(where: Problem, spec: Spec) -> Json:
 
 
 def _remedy(remedy: Remedy) -> Json:
-    kept = ("kind", "options", "step_size", "scatters", "spectral_radius")
+    kept = ("kind", "change", "margin", "options", "step_size", "scatters", "spectral_radius", "updates_to_tenth")
+    found = remedy.diagnosis
     return {name: one for name, one in remedy.plain().items() if name in kept} | {
+        "change": remedy.change[0].upper() + remedy.change[1:],
         "text": remedy.explain(),
+        "error": plain(found.rounded(found.fixed_point_error)),
         "method": None if remedy.kind == "distribution" else remedy.method,
         "verdict": remedy.diagnosis.verdict,
     }

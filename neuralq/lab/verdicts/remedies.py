@@ -36,16 +36,18 @@ _OTHER_METHODS = ("gtd2", "tdrc", "htd", "etd", "lstd", "greedy-gq")
 _WAY_ON = 0.1  # share of the stable interval that is left between the recommendation and its edge
 
 _CHANGES = {
-    "lambda_": "look further along the trajectory: λ = {value:.3g} in TD(λ) (it converges from λ = {edge:.4g} on)",
-    "num_steps": "bootstrap later: n = {value:.0f} steps in n-step TD (n = {edge:.0f} is the first that converges)",
-    "eta": "shrink the weights by a penalty: η = {value:.3g} in ridge TD (it converges from η = {edge:.4g} on)",
-    "phi": "follow the residual gradient for a part: φ = {value:.3g} (it converges from φ = {edge:.4g} on)",
-    "period": "bootstrap from frozen weights: copy them every {value:.0f} updates (T = {edge:.0f} is the first that "
-    "converges)",
-    "tau": "bootstrap from slowly moving weights: τ = {value:.3g} (it converges below τ = {edge:.4g})",
-    "beta_over_alpha": "correct the gradient with a second time scale: TDC with β/α = {value:.3g} (it converges from "
-    "{edge:.4g} on)",
+    "lambda_": ("look further along the trajectory: λ = {value:.3g} in TD(λ)", "from λ = {edge:.4g} on"),
+    "num_steps": ("bootstrap later: n = {value:.0f} steps in n-step TD", "from n = {edge:.0f} on"),
+    "eta": ("shrink the weights by a penalty: η = {value:.3g} in ridge TD", "from η = {edge:.4g} on"),
+    "phi": ("follow the residual gradient for a part: φ = {value:.3g}", "from φ = {edge:.4g} on"),
+    "period": ("bootstrap from frozen weights: copy them every {value:.0f} updates", "from {edge:.0f} updates on"),
+    "tau": ("bootstrap from slowly moving weights: τ = {value:.3g}", "below τ = {edge:.4g}"),
+    "beta_over_alpha": (
+        "correct the gradient with a second time scale: TDC with β/α = {value:.3g}",
+        "from β/α = {edge:.4g} on",
+    ),
 }
+"""What to do and where that begins to converge, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class Remedy:
     Args:
         kind: the parameter that changes, or ``"step_size"``, ``"distribution"`` or ``"method"``.
         change: what to do, in words.
+        margin: where that begins to converge, in words; None where nothing was scanned.
         problem: on which it is diagnosed: the same one, but for ``"distribution"``.
         method: name of the method to use.
         options: of that method.
@@ -67,6 +70,7 @@ class Remedy:
 
     kind: str
     change: str
+    margin: str | None
     problem: Problem
     method: str
     options: Options
@@ -93,7 +97,8 @@ class Remedy:
     def explain(self) -> str:
         """The change and what it costs, in words."""
         found = self.diagnosis
-        text = f"{self.change[0].upper()}{self.change[1:]}."
+        where = "" if self.margin is None else f" (it converges {self.margin})"
+        text = f"{self.change[0].upper()}{self.change[1:]}{where}."
         if found.spectral_radius == 0:
             text += " The mean is right after one application."
         elif found.spectral_radius < 1:
@@ -108,7 +113,9 @@ class Remedy:
     def plain(self) -> dict[str, Any]:
         """The change and what it costs as text and numbers, as JSON takes it."""
         return {
-            **fields_of(self, "kind", "change", "method", "options", "step_size", "critical", "updates_to_tenth"),
+            **fields_of(
+                self, "kind", "change", "margin", "method", "options", "step_size", "critical", "updates_to_tenth"
+            ),
             **fields_of(self.diagnosis, "spectral_radius", "fixed_point_error", "best_error"),
             **fields_of(self, "second_moment_radius", "scatters"),
             "explanation": self.explain(),
@@ -182,8 +189,8 @@ def _parameters(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
         low, high = found.stable[0] if parameter in _FROM_LOW else found.stable[-1]
         edge, far = (low, high) if parameter in _FROM_LOW else (high, low)
         value = _some_way_on(CRITICAL_PARAMETERS[parameter].spacing, edge, far)
-        change = _CHANGES[parameter].format(value=value, edge=edge)
-        yield _remedy(parameter, problem, method(found.method), {parameter: value}, alpha, edge, change)
+        words = (text.format(value=value, edge=edge) for text in _CHANGES[parameter])
+        yield _remedy(parameter, problem, method(found.method), {parameter: value}, alpha, edge, *words)
 
 
 def _some_way_on(spacing: str, edge: float, far: float) -> float:
@@ -198,8 +205,8 @@ def _smaller_steps(problem: Problem, base: str, trouble: Diagnosis) -> Iterator[
     bound = trouble.step_size_bound
     if bound is not None and 0 < bound <= trouble.step_size:
         smaller = bound / 2
-        change = f"take smaller steps: α = {smaller:.3g} (it converges below α = {bound:.4g})"
-        yield _remedy("step_size", problem, method(base), {}, smaller, bound, change)
+        change, margin = f"take smaller steps: α = {smaller:.3g}", f"below α = {bound:.4g}"
+        yield _remedy("step_size", problem, method(base), {}, smaller, bound, change, margin)
 
 
 def _other_methods(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
@@ -221,7 +228,14 @@ def _on_policy(problem: Problem, alpha: float) -> Iterator[Remedy | None]:
 
 
 def _remedy(
-    kind: str, problem: Problem, chosen: Method, options: Options, alpha: float, edge: float | None, change: str
+    kind: str,
+    problem: Problem,
+    chosen: Method,
+    options: Options,
+    alpha: float,
+    edge: float | None,
+    change: str,
+    margin: str | None = None,
 ) -> Remedy | None:
     """The remedy, if its diagnosis says that it is one."""
     try:
@@ -234,7 +248,7 @@ def _remedy(
         second: float | None = chosen.memory_growth(visible_process(linear_process(problem))[0], found.options)
     else:
         second = known_second_moment(problem, chosen, found.options, alpha, "markov")
-    return Remedy(kind, change, problem, chosen.name, found.options, alpha, edge, found, second)
+    return Remedy(kind, change, margin, problem, chosen.name, found.options, alpha, edge, found, second)
 
 
 def _round(updates: float) -> str:

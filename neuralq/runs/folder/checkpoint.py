@@ -34,7 +34,7 @@ from safetensors.torch import load_file, save_file
 from neuralq.checks import check_whole
 from neuralq.runs.folder.files import RunFolderError, open_regular, parse_json, read_regular
 
-__all__ = ["FORMAT_VERSION", "Checkpoint", "CheckpointError", "load", "load_newest", "save"]
+__all__ = ["FORMAT_VERSION", "Checkpoint", "CheckpointError", "load", "load_newest", "save", "storable"]
 
 FORMAT_NAME = "neuralq-checkpoint"
 FORMAT_VERSION = 1
@@ -105,6 +105,18 @@ def save(folder: str | Path, step: int, state: Mapping[str, Any], *, keep: int =
         message = f"could not save step {step} in {folder}: {error}; earlier checkpoints there are intact"
         raise CheckpointError(f"{message}; make room, then resume") from error
     return path
+
+
+def storable(state: Mapping[str, Any]) -> None:
+    """Nothing for a state that `save` can store.
+
+    Raises:
+        TypeError: for a leaf that cannot be stored, naming its place in the tree.
+
+    Example:
+        >>> storable({"seen": {"best": 1.5}})
+    """
+    _Packing().pack(state, "state")
 
 
 def load(path: str | Path) -> Checkpoint:

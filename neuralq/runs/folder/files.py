@@ -7,7 +7,6 @@ names that nobody can foresee, and a pipe or a device in place of a file is refu
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -20,7 +19,12 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
-from neuralq.checks import check_whole
+from neuralq.checks import ELSEWHERE, check_whole
+
+try:
+    import fcntl
+except ImportError as error:
+    raise ImportError(ELSEWHERE) from error
 
 __all__ = [
     "FolderLock",

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import importlib
-import warnings
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
 from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
@@ -26,27 +23,25 @@ from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
+from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS
-from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resumable, untried
+from neuralq.runs.folder.env_probe import PROBE_SECONDS, SIMULATED, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
 from neuralq.runs.recipe.config import RunConfig
-from neuralq.runs.recipe.games import ATARI, make_single, refusals_name, register_games
+from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs, make_one
 from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
+from neuralq.runs.stream.table import TableWalk
 from neuralq.types import QFunction, Transition
-from neuralq_envs import vector_twin
 
 __all__ = [
     "build_q",
     "build_session",
     "engine_name",
-    "has_time_limit",
-    "make_envs",
-    "make_evaluation_envs",
     "normalisation_for",
     "plan_of",
 ]
@@ -56,74 +51,6 @@ _NETWORKS: dict[str, type[ActionInputQ] | type[SeparateQ] | type[ActionOutputQ]]
     "separate": SeparateQ,
     "action-output": ActionOutputQ,
 }
-
-
-_MOST_IN_TURN = 1000
-"""Episodes of evaluation that are played one after another where their environments cannot exist side by side."""
-
-
-def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> VectorEnv[Any, Any, Any]:
-    """Parallel environments: the registered vectorised implementation where there is one, else one after another.
-
-    Gymnasium's Mountain Car and Acrobot are vectorised by `neuralq_envs.classic`, which repeats them to the bit.
-    Elsewhere a single environment is stepped directly, which is quicker than a batch of one.
-
-    Args:
-        config: says which environment.
-        num_envs: how many.
-        training: whether rewards are clipped, and lives counted for episodes, where the configuration wants that.
-
-    Raises:
-        ValueError: if the environment is not registered or cannot be made, with what to do about it.
-    """
-    module, _, env_id = config.env.rpartition(":")
-    register_games(env_id)
-    with refusals_name(config.env):
-        if module:  # registers the environment
-            importlib.import_module(module)
-        spec = gym.spec(env_id)
-        limit = config.env_kwargs.get("max_episode_steps")
-        twin = vector_twin(spec, config.env_kwargs) if limit in (None, -1) or _is_limit(limit) else None
-        if twin is not None:
-            return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
-        if (num_envs > 1 or spec.entry_point is None) and not env_id.startswith(ATARI):
-            vectorised = _own_vectorised(spec, config.env_kwargs, num_envs)
-            if vectorised is not None:
-                return vectorised
-        clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
-        return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
-
-
-def _is_limit(limit: Any) -> bool:
-    return isinstance(limit, int) and not isinstance(limit, bool) and limit > 0
-
-
-def _own_vectorised(spec: EnvSpec, env_kwargs: Mapping[str, Any], num_envs: int) -> VectorEnv[Any, Any, Any] | None:
-    """The environment's own vectorised implementation, where it means what `gymnasium.make` makes of these arguments.
-
-    It does not where there are wrappers, where episodes shall have no limit, which such a class takes for a limit of
-    −1, where it knows less arguments than the single environment, or does not say how it restarts episodes.
-    """
-    given = {name: value for name, value in env_kwargs.items() if name != "disable_env_checker"}
-    limit = given.get("max_episode_steps")
-    if limit is None:
-        given.pop("max_episode_steps", None)
-    elif not _is_limit(limit):
-        return None
-    if spec.vector_entry_point is None or spec.additional_wrappers:
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore" if spec.entry_point is not None else "default")
-        try:
-            envs = gym.make_vec(spec.id, num_envs=num_envs, vectorization_mode="vector_entry_point", **given)
-        except TypeError:
-            if spec.entry_point is None:
-                raise
-            return None
-    if spec.entry_point is None or isinstance((envs.metadata or {}).get("autoreset_mode"), AutoresetMode):
-        return envs
-    envs.close()
-    return None
 
 
 def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) -> QFunction:
@@ -198,6 +125,8 @@ def build_session(config: RunConfig) -> Session:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
     _check_device(config.device)
+    if config.kind.experience == "table":
+        return _walking_session(config)
     envs = make_envs(config, _num_envs(config), training=True)
     try:
         return _session(config, envs)
@@ -205,33 +134,6 @@ def build_session(config: RunConfig) -> Session:
         with contextlib.suppress(Exception):
             envs.close()
         raise
-
-
-def make_evaluation_envs(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any]:
-    """As many environments as there are episodes, or one where there cannot be so many at a time.
-
-    Raises:
-        ValueError: if there cannot be even one.
-    """
-    try:
-        return make_envs(config, num_envs)
-    except ValueError:
-        if not 1 < num_envs <= _MOST_IN_TURN:
-            raise
-        return make_envs(config, 1)
-
-
-def has_time_limit(envs: VectorEnv[Any, Any, Any]) -> bool:
-    """Whether Gymnasium, or the environment's own vectorised implementation, ends every episode some time.
-
-    Example:
-        >>> has_time_limit(make_envs(RunConfig(), 2)), has_time_limit(make_envs(RunConfig(env="CliffWalking-v1"), 1))
-        (True, False)
-    """
-    inner = envs.unwrapped
-    spec = inner.envs[0].spec if isinstance(inner, SyncVectorEnv) else inner.spec
-    limit = None if spec is None else spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
-    return limit is not None and limit > 0
 
 
 def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
@@ -248,14 +150,48 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     frozen = None if normalisation is None else normalisation.frozen()
-    probe = _probe(config, envs)
+    probe = _probe(config, envs, lambda: make_envs(config, _num_envs(config), training=True))
     _warm(config, engine, stream)
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
-        _value_range(config.settings),
+        _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
+
+
+def _walking_session(config: RunConfig) -> Session:
+    """Of a learner that acts by itself, in one environment or its model."""
+    envs: Any = make_one(config)
+    try:
+        simulate = config.settings.simulate
+        stream = TableWalk(envs, config.gamma, seed_for(config.seed, 0), simulate, config.reward_scale)
+        rng = np.random.default_rng(seed_for(config.seed, 2))
+        require_room(config, stream.spec)
+        engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(config.settings), config.engine)
+        learner = _learner(config, engine, stream.spec, rng)
+        stream.begin(learner)
+        cap = MOST_STEPS if config.evaluation_max_steps is None and stream.time_limit else config.evaluation_max_steps
+        return Session(
+            stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None),
+            SIMULATED if stream.simulated else _probe(config, envs, lambda: make_one(config)),
+            config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+            beside=_beside_a_walk(config, envs, stream),
+        )  # fmt: skip
+    except BaseException:
+        with contextlib.suppress(Exception):
+            envs.close()
+        raise
+
+
+def _beside_a_walk(config: RunConfig, env: gym.Env[Any, Any], stream: TableWalk) -> Beside | None:
+    """The exact answer beside action values; what else is learned on a table aims at something else."""
+    algorithm = config.settings.algorithm
+    if algorithm not in ("td-lambda", "r-learning"):
+        return Beside.of(make_vector_env(lambda: env, 1), stream.spec, config.gamma, config.exact)
+    if config.exact:
+        raise ValueError(f"exact=True compares discounted values of actions, and {algorithm} learns none; leave it out")
+    return None
 
 
 def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
@@ -267,11 +203,11 @@ def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
         raise
 
 
-def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
+def _probe(config: RunConfig, envs: Any, make: Callable[[], Any]) -> Resumability:
     if not config.resume_probe:
         return untried(envs)
     return is_resumable(
-        lambda: make_envs(config, _num_envs(config), training=True),
+        make,
         seed_for(config.seed, 5),
         np.random.default_rng(seed_for(config.seed, 6)),
         PROBE_SECONDS,
@@ -317,6 +253,7 @@ def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.r
     parts = Parts(
         engine, config.settings, rng, config.gamma, config.reward_scale, config.total_steps, config.engine,
         another=lambda: _q_on_device(config, spec, 11),
+        exploration=(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps),
     )  # fmt: skip
     return config.kind.build(parts)
 

@@ -14,17 +14,18 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
+from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation, TimeLimit
 
 import neuralq_envs
 from neuralq.checks import check_module_name
+from neuralq.runs.recipe.stand_in import nameless, stand_in
 
-__all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "refusals_name", "register_games"]
+__all__ = ["ATARI", "MINATAR", "is_screen", "make_single", "own_maker", "refusals_name", "register_games"]
 
 MINATAR, ATARI = "MinAtar/", "ALE/"
 _NUM_NOOPS, _FRAME_SKIP, _SIDE, _NUM_STACKED = 30, 4, 84, 4
@@ -73,6 +74,11 @@ def refusals_name(env: str) -> Iterator[None]:
         >>> with refusals_name("CartPole-v1"):
         ...     _ = gym.make("CartPole-v1")
     """
+    if nameless(env) and stand_in() is None:
+        raise ValueError(
+            f"this run was trained on an environment that no name leads to, {env[1:-1]} of a Python program; hand it "
+            "over again: neuralq.load(run, env=...), neuralq.resume(run, env=...) or neuralq.evaluate(run, env=...)"
+        )
     if ":" in env:
         check_module_name("the environment", env.rpartition(":")[0], env)
     try:
@@ -95,11 +101,12 @@ def make_single(
     clip_rewards: bool = False,
     end_on_life_loss: bool = False,
 ) -> gym.Env[Any, Any]:
-    """One environment, by the id that a configuration gives; Atari games come preprocessed.
+    """One environment, by the name that a configuration gives; Atari games come preprocessed.
 
     Args:
-        env: Gymnasium id, or "module:id".
-        env_kwargs: passed to `gymnasium.make`.
+        env: Gymnasium id, "module:id", or "module:name" of a class or function that makes one. What stands in for it
+            (`neuralq.runs.recipe.stand_in`) goes first.
+        env_kwargs: passed to `gymnasium.make`, or to the class or function.
         render_mode: how it is to be drawn, if at all.
         clip_rewards: of Atari screens, to between −1 and 1.
         end_on_life_loss: of Atari screens, whether a lost life terminates the episode; the next one is a new game.
@@ -108,8 +115,12 @@ def make_single(
         >>> make_single("CartPole-v1", {}).action_space.n
         np.int64(2)
     """
+    if (make := stand_in()) is not None:
+        return make()
     register_games(env)
     kwargs = dict(env_kwargs) if render_mode is None else {**env_kwargs, "render_mode": render_mode}
+    if (maker := own_maker(env)) is not None:
+        return _of_own(maker, kwargs)
     if env.startswith(MINATAR) and kwargs.get("render_mode") == "rgb_array":
         # Its pictures are floats of 10 × 10, at which the checker would take offence at every one.
         return _Enlarged(gym.make(env, **{**kwargs, "disable_env_checker": True}))
@@ -126,6 +137,34 @@ def make_single(
         raise
     stacked = FrameStackObservation(frames, _NUM_STACKED)
     return ClipReward(stacked, -1.0, 1.0) if clip_rewards else stacked
+
+
+def own_maker(env: str) -> Callable[..., Any] | None:
+    """The class or function that "module:name" names; None where that is a registered id.
+
+    Example:
+        >>> own_maker("gymnasium.envs.classic_control:CartPoleEnv").__name__, own_maker("CartPole-v1")
+        ('CartPoleEnv', None)
+    """
+    module, _, name = env.rpartition(":")
+    if not module:
+        return None
+    found: Any = importlib.import_module(module)  # may register ids
+    if name in gym.registry:
+        return None
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found if callable(found) else None
+
+
+def _of_own(maker: Callable[..., Any], kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """What a class or function makes; a limit of steps that it does not know is put around it, as Gymnasium does."""
+    given = dict(kwargs)
+    limit = given.pop("max_episode_steps", None)
+    made = maker(**given)
+    if not isinstance(made, gym.Env):
+        raise TypeError(f"{maker!r} must make a gymnasium.Env, and made {type(made).__name__}")
+    return made if limit in (None, -1) else TimeLimit(made, limit)
 
 
 class _Enlarged(gym.Wrapper[Any, Any, Any, Any]):

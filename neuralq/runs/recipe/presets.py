@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import NETWORKS, RunConfig, body_to_dict, config_from_dict
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
+from neuralq.runs.recipe.keywords import nested, with_body
 
-__all__ = ["PRESETS", "preset_for", "with_preset"]
+__all__ = ["PRESETS", "preset_for", "with_preset", "yielding"]
 
 _GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 _MINATAR: dict[str, Any] = {
@@ -212,6 +214,15 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 
+_YIELDS = {
+    "target_rule": ("num_steps",),  # n was chosen for the preset's rule; others may refuse it
+    "block_length": ("num_steps", "target_rule"),
+    "target_rate": ("target_period_updates",),
+    "target_period_updates": ("target_rate",),
+}
+"""What of a preset gives way to a setting that is given."""
+
+
 def preset_for(env: str, learner: str) -> dict[str, Any]:
     """The preset's values, empty where there is none.
 
@@ -224,29 +235,47 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
     return PRESETS.get((env, learner), {})
 
 
-def with_preset(plain: Mapping[str, Any]) -> RunConfig:
+def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a preset's settings of a learner can stand beside those that are given.
+
+    Example:
+        >>> yielding({"target_period_updates": 250, "learning_rate": 1e-3}, {"target_rate": 0.01})
+        {'learning_rate': 0.001}
+    """
+    gone = {over for name, overs in _YIELDS.items() if name in given for over in overs}
+    return {name: value for name, value in settings.items() if name not in gone}
+
+
+def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
     """The configuration of what is given, over the preset of its environment and learner, over the defaults.
 
     Schedules that are not given end within a ``total_steps`` that is (`neuralq.runs.recipe.budget`).
 
     Args:
-        plain: as `config_to_dict` writes it, or any part of that; settings of the learner may be partial too.
+        given: an environment's id; or as `config_to_dict` writes it, or any part of that; settings of the learner may
+            be partial too.
+        settings: fields of the configuration and, flat, settings of its learner; they win.
 
     Raises:
-        ValueError: for unknown keys and values out of range, as `RunConfig` does.
+        ValueError: for unknown names and values out of range, as `RunConfig` does.
 
     Example:
-        >>> config = with_preset({"env": "CartPole-v1", "rollout": {"num_envs": 8}})
+        >>> config = with_preset("CartPole-v1", num_envs=8)
         >>> config.rollout.num_envs, config.reward_scale
         (8, 0.1)
     """
+    if not isinstance(given, Mapping | str):
+        raise ValueError(
+            f"a preset belongs to the id of an environment, or a mapping that holds it as 'env', got {given!r}; an "
+            "environment itself is taken by neuralq.train"
+        )
+    plain = nested({"env": given} if isinstance(given, str) else given, settings)
     learner = plain.get("learner", RunConfig.learner)
+    check_choice("learner", learner, LEARNERS)
     preset = preset_for(plain.get("env", RunConfig.env), learner)
-    if plain.get("layout", RunConfig.layout) not in NETWORKS:
+    if layout_for(learner, plain.get("layout", RunConfig.layout)) not in NETWORKS:
         preset = {name: value for name, value in preset.items() if name != "body"}
     preset, _ = cut_to_budget(preset, plain)
-    given = plain.get(learner) or {}
-    settings = {learner: {**preset.get(learner, {}), **given}}
-    if "target_rule" in given and "num_steps" not in given:  # n was chosen for the preset's rule; others may refuse it
-        settings[learner].pop("num_steps", None)
-    return config_from_dict({**preset, **plain, **settings})
+    given_settings = plain.get(learner) or {}
+    merged = {learner: {**yielding(preset.get(learner, {}), given_settings), **given_settings}}
+    return config_from_dict(with_body({**preset, **plain, **merged}))

@@ -282,9 +282,9 @@ class Interaction:
 
     def _checked_reward(self, reward: Any) -> Array:
         try:
-            if not (type(reward) is np.ndarray and reward.dtype.kind in "biuf"):
-                for one in np.asarray(reward, object).flat:
-                    as_number(one)
+            found = np.asarray(reward)
+            for one in found.flat if found.dtype.kind in "OSU" else ():
+                as_number(one)
             r_t = np.array(reward, np.float64)
         except (TypeError, ValueError) as error:
             raise self._fault(f"field reward: must be numbers, got {reward!r}") from error

@@ -106,8 +106,8 @@ def _check_options(options: Any) -> None:
     words = list(options)
     while words and words[0] in ("--tensorboard", "--wandb"):
         del words[0]
-    if words[:1] == ["--hook"] and len(words) == 2 and re.fullmatch(r"[\w.]+:[\w.]+", str(words[1])):
-        return
+    while words[:1] == ["--hook"] and len(words) > 1 and re.fullmatch(r"[\w.]+:[\w.]+", str(words[1])):
+        del words[:2]
     if words:
         raise ValueError(f"its options hold {words[0]!r}, which no sweep is begun with")
 
@@ -146,7 +146,7 @@ def open_sweep(
 
 
 def has_finished(sweep: Sweep, seed: int) -> bool:
-    """Whether the summary of a seed says that its budget is spent or its target reached."""
+    """Whether the summary of a seed says that its budget is spent, its target reached, or that a hook stopped it."""
     path = sweep.run_path(seed)
     if not (is_run_folder(path) and (path / "summary.json").exists()):
         return False
@@ -157,6 +157,8 @@ def has_finished(sweep: Sweep, seed: int) -> bool:
     if summary.get("interrupted_by") is not None:
         return False
     steps = summary.get("env_steps")
+    if summary.get("stopped_by") is not None:  # by a hook, which would stop it again
+        return True
     return bool(summary.get("reached")) or (isinstance(steps, int) and steps >= sweep.total_steps)
 
 

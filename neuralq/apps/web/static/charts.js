@@ -47,6 +47,13 @@ function view(points, closeup) {
   return { x: [re - half, re + half], y: [im - half, im + half] };
 }
 
+// Whether the leading eigenvalue lies so near the circle that only a close-up tells on which side.
+export function isNearTheEdge(points) {
+  if (points.length === 0) return false;
+  const off = Math.abs(Math.hypot(...points[0]) - 1);
+  return off > 0 && off < 0.03;
+}
+
 export function drawEigenvalues(points, closeup) {
   const size = points.map(([re, im]) => Math.hypot(re, im));
   const outside = size.filter((one) => one > 1).length;
@@ -100,11 +107,34 @@ export function drawErrors(run, prediction) {
   });
 }
 
+// Weights that coincide share a line: [[indices], [values]] in the order of their first.
+function together(rows) {
+  const size = Math.max(...rows.flat().map((one) => Math.abs(one ?? 0)));
+  const groups = [];
+  rows.forEach((row, i) => {
+    const same = groups.find(([, values]) => values.every((one, t) => one === row[t] || Math.abs(one - row[t]) <= 1e-9 * size));
+    if (same) same[0].push(i + 1);
+    else groups.push([[i + 1], row]);
+  });
+  return groups;
+}
+
+// 1, 2, 3, 5 as "w1–w3, w5".
+function named(numbers) {
+  const runs = [];
+  for (const i of numbers) {
+    if (runs.length && runs[runs.length - 1][1] === i - 1) runs[runs.length - 1][1] = i;
+    else runs.push([i, i]);
+  }
+  return runs.map(([from, to]) => (from === to ? `w${from}` : `w${from}–w${to}`)).join(", ");
+}
+
 export function drawWeights(run) {
-  const label = `The first ${run.weights.length} of ${run.num_weights} weights over time`;
+  const groups = together(run.weights);
+  const label = `The first ${run.weights.length} of ${run.num_weights} weights over time; lines: ${groups.map(([numbers]) => named(numbers)).join("; ")}`;
   draw("weights", label, () => [
-    run.weights.map((row, i) => ({
-      type: "scatter", mode: "lines", name: `w${i + 1}`, x: run.steps, y: row,
+    groups.map(([numbers, row], i) => ({
+      type: "scatter", mode: "lines", name: named(numbers), x: run.steps, y: row,
       line: { color: colour(`--line-${(i % 8) + 1}`), width: 2, dash: i < 8 ? "solid" : "dot" },
     })),
     { showlegend: true, xaxis: { title: { text: "updates", standoff: 4 }, nticks: 6 }, yaxis: { exponentformat: "power", nticks: 6 } },

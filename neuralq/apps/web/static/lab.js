@@ -1,7 +1,8 @@
 // The page: what is chosen, the link that says so, the questions to the server, and what came back.
 
-import { drawEigenvalues, drawErrors, drawWeights, redrawAll, stale } from "./charts.js";
+import { drawEigenvalues, drawErrors, drawWeights, isNearTheEdge, redrawAll, stale } from "./charts.js";
 import { showNumbers } from "./numbers.js";
+import { remedyTable } from "./remedies.js";
 import { makeSlider } from "./sliders.js";
 import { VERDICTS, bound, factor, list, short } from "./words.js";
 
@@ -19,6 +20,7 @@ const latest = {}; // kind of question -> its AbortController; a newer one ends 
 let timer;
 let diagnosis = null;
 let ran = null;
+const wantsCloseup = { chosen: false }; // until the visitor decides, the picture does
 
 const problemOf = () => lab.problems.find((one) => one.name === chosen.problem);
 const methodOf = () => lab.methods.find((one) => one.name === chosen.method);
@@ -140,8 +142,12 @@ function showDiagnosis(found) {
   say("verdict-word", word);
   say("verdict-number", `ρ = ${factor(found.spectral_radius)}${found.local ? ", near the initial weights" : ""}`);
   say("explanation", found.explanation);
+  if (!wantsCloseup.chosen) $("closeup").checked = isNearTheEdge(found.eigenvalues);
   drawEigenvalues(found.eigenvalues, $("closeup").checked);
-  $("closeup").onchange = () => drawEigenvalues(found.eigenvalues, $("closeup").checked);
+  $("closeup").onchange = () => {
+    wantsCloseup.chosen = true;
+    drawEigenvalues(found.eigenvalues, $("closeup").checked);
+  };
   showNumbers($("numbers"), found);
 }
 
@@ -253,17 +259,7 @@ function findHelp() {
   $("help").replaceChildren();
   press("find-help", "help-status", "prescribe", place(), ({ remedies }) => {
     $("help-status").textContent = remedies.length ? `${remedies.length} remedies.` : "Nothing is needed: TD(0), or the problem's own control method, converges here.";
-    $("help").replaceChildren(...remedies.map((remedy) => {
-      const item = document.createElement("li");
-      item.textContent = remedy.text;
-      if (remedy.method !== null) {
-        const button = Object.assign(document.createElement("button"), { type: "button", textContent: "Try it" });
-        button.setAttribute("aria-label", `Try it: ${remedy.text.split(":")[0]}`);
-        button.addEventListener("click", () => tryRemedy(remedy));
-        item.append(" ", button);
-      }
-      return item;
-    }));
+    $("help").replaceChildren(...(remedies.length ? [remedyTable(remedies, tryRemedy)] : []));
     $("help").dataset.of = key;
   });
 }

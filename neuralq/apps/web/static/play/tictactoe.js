@@ -37,7 +37,7 @@ function show(found) {
   squares.forEach((button, cell) => {
     const sign = cells[cell], value = $("values").checked ? values[cell] : null;
     const line = result?.line?.includes(cell);
-    button.className = `${sign} ${line ? "won" : ""}`.trim();
+    button.className = [sign, line ? "won" : "", value ? `worth-${value}` : ""].filter(Boolean).join(" ");
     button.setAttribute("aria-disabled", String(Boolean(sign) || result !== null)); // it keeps the focus
     button.tabIndex = cell === chosen ? 0 : -1;
     const where = `Row ${Math.floor(cell / 3) + 1}, column ${(cell % 3) + 1}`;
@@ -100,7 +100,7 @@ document.addEventListener("keydown", (event) => {
 $("undo").addEventListener("click", () => act("undo"));
 $("as-x").addEventListener("click", () => act("new", { player: "X" }));
 $("as-o").addEventListener("click", () => act("new", { player: "O" }));
-$("values").checked = remembered("values", "on") === "on";
+$("values").checked = remembered("values", "") === "on";
 $("values").addEventListener("change", () => {
   remember("values", $("values").checked ? "on" : "");
   if (state !== null) show(state);
