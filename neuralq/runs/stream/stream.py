@@ -282,7 +282,7 @@ class Interaction:
 
     def _checked_reward(self, reward: Any) -> Array:
         try:
-            found = np.asarray(reward)
+            found = reward if isinstance(reward, np.ndarray) else np.array(reward)
             for one in found.flat if found.dtype.kind in "OSU" else ():
                 as_number(one)
             r_t = np.array(reward, np.float64)

@@ -152,7 +152,7 @@ def as_number(reward: Any) -> Any:
     Raises:
         TypeError: it is text.
     """
-    if not isinstance(reward, float | int) and np.asarray(reward).dtype.kind in "SU":
+    if isinstance(reward, str | bytes) or (isinstance(reward, np.ndarray) and reward.dtype.kind in "SU"):
         raise TypeError("text is no number")
     return reward
 
