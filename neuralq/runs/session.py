@@ -76,7 +76,7 @@ class Session:
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
-    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    say: Callable[[str], None] = field(init=False, default_factory=lambda: _unheard)
     _early: EarlyReturns | None = field(init=False, default=None)
     on_step: Callable[[], None] | None = field(init=False, default=None)
     on_update: Callable[[], None] | None = field(init=False, default=None)
@@ -400,6 +400,10 @@ class Session:
             if envs is not None:
                 with contextlib.suppress(Exception):
                     envs.close()
+
+
+def _unheard(line: str) -> None:
+    """Where nobody listens."""
 
 
 def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:
