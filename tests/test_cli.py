@@ -242,7 +242,7 @@ def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> N
         ("replay: {capacity: 500}", "settings for the replay learner would be ignored"),
         (
             "learner: sarsa",
-            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', got 'sarsa'",
+            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', 'tabular', got 'sarsa'",
         ),
         ("learner: [rollout]", "learner must be text, got ['rollout']"),
         ("total_steps: many", "total_steps must be a whole number, got 'many'"),

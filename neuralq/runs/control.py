@@ -23,7 +23,7 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.files import plain_values, read_rows, to_json, write_durably
 from neuralq.runs.folder.origin import compared
-from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
+from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.recipe.build import (
@@ -33,13 +33,14 @@ from neuralq.runs.recipe.build import (
     normalisation_for,
     plan_of,
 )
-from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.runs.warm_start import begun_from
 from neuralq.runs.watchers import monitor_verdict, watchers
 
 __all__ = ["CONTROL", "Run", "agent_of", "evaluate_run", "last_cap"]
@@ -65,6 +66,8 @@ class Run:
         play_off: of a run that ended below its best evaluation, what that was decided by
             (`neuralq.runs.evaluation.play_off`); else None.
         exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
+        measured: what it learned that is no value of an action: of prediction the start's value and the distance from
+            exact values, of R-learning the reward per step; empty for others.
         monitor: what the monitor of divergence says (`neuralq.lab.DivergenceMonitor.verdict`); None without it.
     """
 
@@ -82,6 +85,7 @@ class Run:
     agent: str = "final"
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
+    measured: dict[str, float] = dataclasses.field(default_factory=dict)
     monitor: dict[str, Any] | None = None
 
     def plain(self) -> dict[str, Any]:
@@ -90,13 +94,15 @@ class Run:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
+        score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
         )
         lines = [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}",
+            *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
         ]
         if self.play_off is not None:
@@ -127,6 +133,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         agent=agent,
         play_off=play_off,
         exact=exact,
+        measured=session.measures(),
         monitor=monitor_verdict(progress.hook_states),
     )
 
@@ -205,12 +212,16 @@ def _kept(run_dir: Path, best: bool | None) -> tuple[Tensor, Any, Any]:
             raise checkpoint.CheckpointError(f"{error}; these are the run's agent, --final takes the last") from error
         return kept.parameters, kept.normalisation, kept.scalings
     saved = newest.state
-    compared(saved.get("origin"), read_config(run_dir), newest.path)
+    compared(saved.get("origin"), read_config(run_dir), newest.path, read_changes(run_dir))
     state = saved["learner"]
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
         parameters = state["average"]["values"]
     return torch.as_tensor(parameters), saved["stream"].get("normalisation"), saved["stream"].get("scalings")
+
+
+def _chosen(run_dir: Path) -> Agent:
+    return _load_agent(run_dir, None)
 
 
 def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool | None = None) -> Evaluation:
@@ -221,10 +232,18 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
         num_episodes: how many episodes.
         seed: of the episodes; unrelated to those seen in training.
         best: True to play with the parameters whose greedy evaluation scored highest, False with the last.
+
+    Raises:
+        ValueError: if the run has learned no policy.
     """
     check_whole("num_episodes", num_episodes)
     check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
+    if not getattr(config.settings, "acts", True):
+        raise ValueError(
+            f"{run_dir} predicts and has no policy that could be played; its metrics have what it learned: "
+            f"neuralq report {run_dir}"
+        )
     agent = _load_agent(run_dir, best)
     with limited_threads(config.threads):
         envs = make_evaluation_envs(config, min(num_episodes, 64))
@@ -233,7 +252,8 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
             with torch.no_grad():
                 most = config.evaluation_max_steps or last_cap(run_dir)
                 found = evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
-            beside = Beside.of(envs, stream.spec, config.gamma, config.exact)
+            discounts = getattr(config.settings, "discounts", True)
+            beside = Beside.of(envs, stream.spec, config.gamma, config.exact) if discounts else None
             if beside is None:
                 return found
             beside.load_state_dict(checkpoint.load_newest(Path(run_dir) / "checkpoints").state.get("met"))
@@ -271,15 +291,17 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
         notes.append(f"greedy {shown(latest['greedy_return'])}{goal}")
+    notes += [f"{name.replace('_', ' ')} {latest[name]:.3g}" for name in _MEASURES if name in latest]
     if latest.get("num_cut"):
         notes.append(f"{latest['num_cut']} of {len(latest['returns'])} evaluation episodes cut")
     return notes
 
 
+_MEASURES = ("value_error_rms", "average_reward")
 _CHANGEABLE = frozenset(
     "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
     "resume_probe exact monitor".split()
-)
+) | {f"{name}.{setting}" for name, kind in LEARNERS.items() for setting in kind.step_sizes}
 CONTROL = Kind(
     name="control",
     title="a run on an environment",
@@ -296,5 +318,6 @@ CONTROL = Kind(
     notes=_notes,
     changeable=_CHANGEABLE,
     opening=_opening,
+    start=lambda config, session: config if config.warm_start is None else begun_from(config, session, _chosen),
     watchers=watchers,
 )

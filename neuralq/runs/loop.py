@@ -18,7 +18,7 @@ from neuralq.learners.learner import Learner
 from neuralq.runs.folder import checkpoint, origin
 from neuralq.runs.folder.best import Best, keep_best, load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
+from neuralq.runs.folder.run_folder import RunFolder, read_changes, warn_of_lost_rows
 from neuralq.runs.stop_request import StopAsked, StopRequest
 from neuralq.runs.stream.experience import Sample
 from neuralq.runs.watching import Hook, HookFault, Listener, Observer, Watch, say_to
@@ -206,7 +206,7 @@ def continued(trainee: Trainee, folder: RunFolder) -> Progress:
         return Progress()
     saved = checkpoint.load_newest(folder.checkpoints_path)
     state = saved.state
-    moved = origin.compared(state.get("origin"), folder.config, saved.path)
+    moved = origin.compared(state.get("origin"), folder.config, saved.path, read_changes(folder.path))
     trainee.load_state_dict(state)
     folder.truncate_metrics(trainee.env_steps)
     warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,10 +24,11 @@ from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.stream import Interaction, Policy, Step
+from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.runs.stream.experience import ExperienceSource, Sample
+from neuralq.runs.stream.table import TableWalk
 from neuralq.types import Array
 
 __all__ = ["Session", "cap_on_evaluation"]
@@ -38,9 +39,9 @@ class Session:
     """The mutable parts of a run on an environment; a `neuralq.runs.loop.Trainee`.
 
     Args:
-        stream: experience from the training environments.
-        policy: the behaviour.
-        experience: between stream and learner.
+        stream: experience from the training environments; or a walk, which acts and learns by itself.
+        policy: the behaviour; None with a walk.
+        experience: between stream and learner; None with a walk.
         learner: what learns.
         generators: every generator in use, by name.
         make_evaluation: makes an interaction with environments of its own for evaluation; called when first needed.
@@ -55,9 +56,9 @@ class Session:
         beside: holds what is learned against the exact answer, where the environment has a model.
     """
 
-    stream: Interaction
-    policy: Policy
-    experience: ExperienceSource
+    stream: Interaction | TableWalk
+    policy: Policy | None
+    experience: ExperienceSource | None
     learner: Learner
     generators: dict[str, np.random.Generator]
     make_evaluation: Callable[[], Interaction]
@@ -75,7 +76,7 @@ class Session:
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
-    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    say: Callable[[str], None] = field(init=False, default_factory=lambda: _unheard)
     _early: EarlyReturns | None = field(init=False, default=None)
     on_step: Callable[[], None] | None = field(init=False, default=None)
     on_update: Callable[[], None] | None = field(init=False, default=None)
@@ -119,7 +120,11 @@ class Session:
 
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
+        if isinstance(self.stream, TableWalk):
+            self._walk(self.stream, until, request)
+            return
         stream, experience, learner = self.stream, self.experience, self.learner
+        assert self.policy is not None and experience is not None
         device, beside = learner.engine.flat.values.device, self.beside
         on_cpu = device.type == "cpu"
         while True:
@@ -129,9 +134,7 @@ class Session:
                 beside.see(step.rows[0], step.rows[1])
             if self._early is not None:
                 self._early = self._early.add(step)
-            for episode in step.episodes:
-                self._recent_returns.append(episode.episode_return)
-                self._longest = max(self._longest, episode.length)
+            self._count(step.episodes)
             if self.on_step is not None:
                 self.on_step()
             for sample in experience.draw():
@@ -145,6 +148,23 @@ class Session:
             if experience.between_samples and (stream.num_steps >= until or request.name is not None):
                 return
 
+    def _walk(self, walk: TableWalk, until: int, request: StopRequest) -> None:
+        """A walk learns as it goes, so whoever wants to see its steps sees them when they have been learned from."""
+        watched = list(filter(None, (self.on_step, self.on_update)))
+        while walk.num_steps < until and request.name is None:
+            self._count(walk.advance(walk.num_steps + 1 if watched else until, request))
+            if watched:
+                self.last_step = walk.last_step()
+            for tell in watched:
+                tell()
+        if self.beside is not None and self.beside.visited is not None:
+            self.beside.see(*walk.met())
+
+    def _count(self, episodes: Iterable[Episode]) -> None:
+        for episode in episodes:
+            self._recent_returns.append(episode.episode_return)
+            self._longest = max(self._longest, episode.length)
+
     def training_row(self) -> dict[str, Any]:
         """Mean return of recent episodes, number of updates, and what the last one saw."""
         recent = float(np.mean(self._recent_returns)) if self._recent_returns else None
@@ -152,13 +172,11 @@ class Session:
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed, in the environment's units."""
-        if self._last is None:
+        update = self.last_update
+        if update is None:
             return self._metrics_before
         scale = self.value_scale
-        return {
-            name: value / (scale * scale if name == "loss" else scale)
-            for name, value in self._last[0].metrics().items()
-        }
+        return {name: value / (scale * scale if name == "loss" else scale) for name, value in update.metrics().items()}
 
     @property
     def value_scale(self) -> float:
@@ -168,7 +186,9 @@ class Session:
 
     @property
     def last_update(self) -> Update | None:
-        """What the last update saw."""
+        """What the last update saw; of a walk, what the values of the moment say of its last steps."""
+        if isinstance(self.stream, TableWalk):
+            return self.stream.last_update()
         return None if self._last is None else self._last[0]
 
     @property
@@ -180,7 +200,8 @@ class Session:
         """Action values of observations in the environment's units, with the parameters that the learner plays with."""
         stream = self.stream
         seen = None if stream.normalisation is None else stream.normalisation.frozen()
-        _, first_action = discrete_actions(stream.envs.single_action_space)
+        space = stream.envs.action_space if isinstance(stream, TableWalk) else stream.envs.single_action_space
+        _, first_action = discrete_actions(space)
         agent = Agent(self.learner.engine.q, stream.encoder, stream.spec, first_action, self.value_scale, seen)
         with evaluating_with(self.learner):
             return agent.values(observation)
@@ -244,17 +265,24 @@ class Session:
 
         An environment that can exist only once is not evaluated, which a warning says.
         """
+        measured = self.measures()
+        if not getattr(getattr(self.learner, "settings", None), "acts", True):
+            return measured, None
         if not self._can_evaluate():
-            return {}, None
+            return measured, None
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
-        columns |= self._beside_exact()
+        columns |= measured | self._beside_exact()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def measures(self) -> dict[str, float]:
+        """What a learner of something else than action values has learned; empty for others."""
+        return self.stream.measures() if isinstance(self.stream, TableWalk) else {}
 
     def _beside_exact(self) -> dict[str, Any]:
         """Columns on what is learned beside the exact answer."""
@@ -308,7 +336,7 @@ class Session:
                 "longest_episode": self._longest,
             },
             "learner": self.learner.state_dict(),
-            "feed": self.experience.state_dict(),
+            "feed": {} if self.experience is None else self.experience.state_dict(),
             "stream": self.stream.state_dict(),
             "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
@@ -319,6 +347,8 @@ class Session:
         """The environments' own state; None where it cannot be taken, or no longer can."""
         if not self.resumability.exact:
             return None
+        if isinstance(self.stream, TableWalk) and self.stream.simulated:
+            return {}
         try:
             return encode_env(self.stream.envs)
         except NotCopyable as error:
@@ -342,7 +372,8 @@ class Session:
         self.learner.load_state_dict(state["learner"])
         if self.beside is not None:
             self.beside.load_state_dict(state.get("met"))
-        self.experience.load_state_dict(state["feed"])
+        if self.experience is not None:
+            self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]
         if self._restored(state["environments"]):
@@ -354,8 +385,8 @@ class Session:
             self.learner.begin_streams()
 
     def _restored(self, environments: Mapping[str, Any] | None) -> bool:
-        if environments is None:
-            return False
+        if not environments:  # none where a model is simulated
+            return environments is not None
         try:
             restore_env(self.stream.envs, environments)
         except NotCopyable as error:
@@ -365,9 +396,14 @@ class Session:
 
     def close(self) -> None:
         """Close the environments."""
-        for stream in filter(None, (self.stream, self._evaluation)):
-            with contextlib.suppress(Exception):
-                stream.envs.close()
+        for envs in (self.stream.envs, None if self._evaluation is None else self._evaluation.envs):
+            if envs is not None:
+                with contextlib.suppress(Exception):
+                    envs.close()
+
+
+def _unheard(line: str) -> None:
+    """Where nobody listens."""
 
 
 def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:
