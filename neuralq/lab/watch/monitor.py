@@ -113,16 +113,15 @@ class DivergenceMonitor:
         seed: int = 0,
         share: float | None = None,
     ) -> None:
-        if largest_reward is not None:
-            check_positive("largest_reward", largest_reward)
+        for name, value in (("largest_reward", largest_reward), ("share", share)):
+            if value is not None:
+                check_positive(name, value)
         if not margin >= 1:
             raise ValueError(f"margin must be at least 1, got {margin!r}")
         check_whole("num_samples", num_samples, 2)
         check_whole("every", every, 0)
         check_whole("window", window, 8)
         check_whole("seed", seed, 0)
-        if share is not None:
-            check_positive("share", share)
         self.traits = traits
         self.alarms: list[Alarm] = []
         self.diagnoses: list[tuple[int, SampleDiagnosis]] = []
@@ -134,11 +133,10 @@ class DivergenceMonitor:
         self._latest: SampleDiagnosis | None = None
         self._resumed = False
         self._looks = self._next_kernel = self._kernels = 0
-        self._seen_bound = 0.0
+        self._seen_bound = self._largest_value = self._run_seconds = 0.0
         self._value_now: float | None = None
-        self._largest_value = 0.0
-        self._env_steps = 0
-        self._share, self._since_seconds, self._run_seconds = share, None, 0.0
+        self._since_seconds: float | None = None
+        self._env_steps, self._share = 0, share
         self._look_seconds, self._kernel_seconds = _FIRST_LOOK_SECONDS, _FIRST_KERNEL_SECONDS
         self.cpu_seconds = 0.0
         """What it has cost so far."""
