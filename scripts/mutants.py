@@ -60,7 +60,7 @@ ROOMS = {
 EQUIVALENT = ROOT / "scripts" / "equivalent_mutants.toml"
 MARK = 0.95  # of the mutants that compute something else
 MOST_SECONDS = 120.0  # that the tests of one mutant may take
-SHOWN = ("frozen", "slots", "repr", "eq", "compare")  # how a record is shown and kept, not what it computes
+SHOWN = ("frozen", "slots", "repr", "eq", "compare", "place")  # how a record is shown and kept, not what it computes
 LIMIT = 240.0  # seconds until they are stopped; a test alone: 20 and five times what it takes, more where it compiles
 OPERATORS = [
     f"core/{operator}"
