@@ -103,6 +103,7 @@ def test_the_parts_stand_in_the_order_verdict_run_words(capsys: Capture, monkeyp
     assert "tilted start" in printed(capsys, "car-on-the-hill", "--start", "tilted", "--regressor", "nearest")
 
 
+@pytest.mark.slow
 def test_everything_is_passed_on(capsys: Capture) -> None:
     near = answer(capsys, "puddle-world", "--regressor", "nearest", "--neighbours", "3", "--gamma", "0.9")
     expected = diagnose_fitted(puddle_world(), grid_support(puddle_world(), 16), NearestNeighbours(3), gamma=0.9)
@@ -134,6 +135,7 @@ def test_errors_are_against_exact_costs_where_those_are_known(capsys: Capture) -
     assert exact["error"][0] == [0, 0.0]  # the nearest point of a point is itself
 
 
+@pytest.mark.slow
 def test_growing_the_support_finds_the_shortest_paths(capsys: Capture) -> None:
     grown = answer(capsys, "gridworld", "--grow-support")["grown"]
     assert grown["complete"] and grown["num_points"] == grown["num_reached"] == 256
@@ -144,6 +146,7 @@ def test_growing_the_support_finds_the_shortest_paths(capsys: Capture) -> None:
     assert strict["history"] != lax["history"]
 
 
+@pytest.mark.slow
 def test_the_table_has_every_world_under_every_regressor(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     text = printed(capsys, "--points", "8", "--max-iterations", "200")

@@ -227,6 +227,7 @@ for given in ({"halfway_share": 0.5}, {"target_rule": "halfway", "halfway_share"
 """
 
 
+@pytest.mark.slow
 def test_a_target_rule_in_a_file_of_its_own_is_learned_with_every_distribution(tmp_path: Path) -> None:
     (tmp_path / "halfway.py").write_text(HALFWAY)
     assert said_by(tmp_path, "rules", TRIED).splitlines() == [

@@ -77,7 +77,7 @@ class Session:
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
-    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    say: Callable[[str], None] = field(init=False, default_factory=lambda: _unheard)
     _early: EarlyReturns | None = field(init=False, default=None)
     on_step: Callable[[], None] | None = field(init=False, default=None)
     on_update: Callable[[], None] | None = field(init=False, default=None)
@@ -266,17 +266,24 @@ class Session:
 
         An environment that can exist only once is not evaluated, which a warning says.
         """
+        measured = self.measures()
+        if not getattr(getattr(self.learner, "settings", None), "acts", True):
+            return measured, None
         if not self._can_evaluate():
-            return {}, None
+            return measured, None
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
-        columns |= self._beside_exact()
+        columns |= measured | self._beside_exact()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def measures(self) -> dict[str, float]:
+        """What a learner of something else than action values has learned; empty for others."""
+        return self.stream.measures() if isinstance(self.stream, TableWalk) else {}
 
     def _beside_exact(self) -> dict[str, Any]:
         """Columns on what is learned beside the exact answer."""
@@ -394,6 +401,10 @@ class Session:
             if envs is not None:
                 with contextlib.suppress(Exception):
                     envs.close()
+
+
+def _unheard(line: str) -> None:
+    """Where nobody listens."""
 
 
 def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:

@@ -58,7 +58,7 @@ COMMANDS = {
     "evaluate": _of("runs", "evaluate", "play greedy episodes with a trained run", _LOOK),
     "report": _of("runs", "report", "write a run's report.html", _LOOK),
     "compare": _of("compare", "compare", "table and plot of several runs or sweeps side by side", _LOOK),
-    "presets": _of("presets", "presets", "list the tuned settings per environment", _LOOK),
+    "presets": _of("presets", "presets", "an overview of tuned settings, or one of them whole", _LOOK),
     "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),
     "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
     "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),

@@ -15,6 +15,7 @@ from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LAYOUTS, LEARNERS
+from neuralq.runs.recipe.replay_presets import AGENTS
 
 __all__ = ["TrainOptions", "add_fields", "train_parser"]
 
@@ -42,7 +43,7 @@ class TrainOptions:
         seeds: how many seeds to run side by side, or None for one run.
         workers: how many of them at a time, or None for as many as there are cores.
         json: whether to print the result as JSON.
-        preset: whether a preset gave defaults.
+        preset: the preset that gave defaults, in words; empty for none.
         notes: what was made of schedules that the budget would not have let finish.
     """
 
@@ -53,7 +54,7 @@ class TrainOptions:
     seeds: int | None
     workers: int | None
     json: bool
-    preset: bool
+    preset: str
     notes: tuple[str, ...]
 
 
@@ -119,7 +120,7 @@ _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ("activation", str, "NAME", "relu, tanh or leaky_relu"),
     ("config", str, "FILE", "YAML file of options, as --print-config writes it"),
     ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
-    ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
+    ("preset", str, "NAME", f"true (the environment's), false, or a whole agent: {', '.join(AGENTS)} (default: true)"),
     ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),
     ("workers", int, "N", "how many seeds at a time (default: as many as there are cores)"),
     ("hook", str, "module:name", "function or class of your own that watches the run (docs/hooks.md); may be repeated"),

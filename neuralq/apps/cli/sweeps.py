@@ -73,7 +73,7 @@ def _default_path(config: RunConfig) -> Path:
 
 def started_from(config: RunConfig, options: TrainOptions) -> str:
     """Where the settings come from that nobody gave, for the first line of a run."""
-    preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
+    preset = f"; {options.preset} (see neuralq presets)" if options.preset else ""
     if not options.notes:
         return preset
     return f"{preset}; within {config.total_steps:,} steps {', '.join(options.notes)}"

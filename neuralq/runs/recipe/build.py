@@ -221,7 +221,7 @@ def _walking_session(config: RunConfig) -> Session:
 def _beside_a_walk(config: RunConfig, env: gym.Env[Any, Any], stream: TableWalk) -> Beside | None:
     """The exact answer beside action values; what else is learned on a table aims at something else."""
     algorithm = config.settings.algorithm
-    if algorithm not in ("td-lambda", "r-learning"):
+    if config.settings.discounts:
         return Beside.of(make_vector_env(lambda: env, 1), stream.spec, config.gamma, config.exact)
     if config.exact:
         raise ValueError(f"exact=True compares discounted values of actions, and {algorithm} learns none; leave it out")
