@@ -85,6 +85,10 @@ def record(argv: list[str]) -> int:
         return _record_steps(options)
     if options.epsilon is not None:
         raise Failure("--epsilon is for recorded steps, and a film is greedy; add --to FILE.npz or leave it out", 2)
+    return _record_pictures(options)
+
+
+def _record_pictures(options: argparse.Namespace) -> int:
     if (options.fps is not None and not 0 < options.fps <= 1000) or not 16 <= options.width <= 4096:
         raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
     path = single_run(options.run, options.trust)
