@@ -7,11 +7,13 @@ a return that loses what was earned in an earlier call · anything of a loop tha
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import blackjack_exact
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from neuralq import RunConfig
 from neuralq.learners import TabularSettings
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.control import evaluate_run
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.recipe.build import build_session
 from neuralq.runs.session import Session
@@ -260,3 +263,105 @@ def test_a_run_of_a_table_trains_resumes_and_answers(tmp_path: Path) -> None:
     agent = neuralq.load(run.run_dir)
     values = agent.values(0)
     assert values.shape == (4,) and agent.predict(0) == int(np.argmax(values))
+
+
+def test_prediction_tells_the_value_of_the_start_and_how_far_it_is_from_exact(tmp_path: Path) -> None:
+    """From the middle of nineteen states a fair walk ends on either side alike (Sutton & Barto 2018, example 7.1)."""
+    made = config("neuralq/RandomWalk19-v0", {"algorithm": "td-lambda"}, gamma=1.0, total_steps=60_000)
+    run = neuralq.train(made, tmp_path / "walk")
+    assert run.measured["exact_start_value"] == pytest.approx(0.0, abs=1e-9) and run.greedy_return is None
+    values = neuralq.load(run.run_dir).values
+    error = [values(s)[0] - (s - 10) / 10 for s in range(1, 20)]  # the ends are 0 and 20
+    assert run.measured["value_error_rms"] == pytest.approx(np.sqrt(np.mean(np.square(error)))) and max(error) < 0.1
+    with pytest.raises(ValueError, match="has no policy that could be played"):
+        evaluate_run(run.run_dir)
+    two = config("FrozenLake-v1", {"algorithm": "td-lambda", "simulate": False}, gamma=0.9, total_steps=30_000)
+    seen = build_session(two)
+    walked(seen, 30_000)
+    model = build_session(dataclasses.replace(two, tabular=TabularSettings(algorithm="td-lambda")))
+    walked(model, 30_000)
+    exact = model.measures()["exact_start_value"]
+    assert seen.measures()["start_value"] == pytest.approx(exact, abs=0.003)
+    assert model.measures()["start_value"] == pytest.approx(exact, abs=0.003)
+
+
+class Purse(gym.Env[Any, Any]):
+    """For ever: stay and earn 1, or go to and fro and earn 0 and 4."""
+
+    def __init__(self) -> None:
+        self.observation_space, self.action_space, self.s = spaces.Discrete(2), spaces.Discrete(2), 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.s = 0
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        reward = 1.0 if action == 0 else 4.0 * self.s
+        self.s = self.s if action == 0 else 1 - self.s
+        return self.s, reward, False, False, {}
+
+
+def test_r_learning_tells_the_reward_per_step() -> None:
+    gym.register("Purse-v0", Purse, disable_env_checker=True, max_episode_steps=1000)
+    try:
+        session = build_session(config("Purse-v0", {"algorithm": "r-learning"}, reward_scale=0.5))
+        walked(session, 20_000)
+        columns, scored = session.evaluate(0)
+    finally:
+        del gym.registry["Purse-v0"]
+    # Actions are random in one step of 20 (ε), so a little less than the 2 of going to and fro.
+    assert columns["average_reward"] == pytest.approx(2.0, abs=0.15)
+    assert scored is not None and scored.greedy_return == 2000.0
+
+
+def played(config_: RunConfig, limit: int, gamma: float = 1.0) -> float:
+    """Exact expected return of the greedy policy within the time limit, by backwards induction over the model."""
+    mdp = FiniteMDP.from_gymnasium(gym.make(config_.env, **config_.env_kwargs), check=False)
+    session = walked(build_session(config_), config_.total_steps)
+    legal = session.learner.loop.table.q > -np.inf  # type: ignore[attr-defined]
+    entries = session.learner.engine.flat.values.numpy().reshape(legal.shape)
+    rows = mdp.row_index[np.arange(mdp.num_states), np.where(legal, entries, -np.inf).argmax(1)]
+    v = np.zeros(mdp.num_states)
+    for _ in range(limit):
+        v = np.where(rows >= 0, mdp.reward[rows] + gamma * (mdp.transition[rows] @ v), 0.0)
+    return float(mdp.start_distribution @ v)
+
+
+@pytest.mark.parametrize(
+    ("env", "limit", "least"),
+    # The optimum of slippery 4 x 4 ice within 100 steps is 0.7402 (backwards induction for the policy of γ = 0.99).
+    [("Taxi-v4", 200, 7.0), ("CliffWalking-v1", 1000, -13.0), ("FrozenLake-v1", 100, 0.7402 - 0.02)],
+)
+@pytest.mark.parametrize("preset", [True, False])
+def test_what_is_learned_by_default(env: str, limit: int, least: float, preset: bool) -> None:
+    for seed in range(100, 105):
+        plain = {"env": env, "learner": "tabular", "seed": seed, "total_steps": 100_000, "exact": False}
+        assert played(neuralq.with_preset(plain) if preset else neuralq.RunConfig(**plain), limit) >= least
+
+
+@pytest.mark.slow
+def test_blackjack_is_played_within_a_hundredth_of_the_optimum() -> None:
+    optimum = blackjack_exact.value(None)
+    assert optimum == pytest.approx(-0.0431, abs=5e-4)
+    for seed in range(100, 105):
+        made = neuralq.with_preset({"env": "Blackjack-v1", "learner": "tabular", "seed": seed, "exact": False})
+        session = walked(build_session(made), made.total_steps)
+        q = session.learner.engine.flat.values.numpy().reshape(32, 11, 2, 2)  # as Tuple's parts, then the action
+        found = blackjack_exact.value(lambda total, shown, ace, q=q: int(q[total, shown, int(ace)].argmax()))
+        assert found >= optimum - 0.01
+
+
+@pytest.mark.slow
+def test_the_arithmetic_of_blackjack_is_that_of_the_game() -> None:
+    env = gym.make("Blackjack-v1")
+    env.reset(seed=0)
+    for choose in (lambda total, shown, ace: int(total < 20), lambda total, shown, ace: int(ace and total < 21)):
+        returns = []
+        for _ in range(40_000):
+            observation, ended = env.reset()[0], False
+            while not ended:
+                observation, reward, ended, _, _ = env.step(choose(*observation))
+            returns.append(reward)
+        error = np.std(returns) / 200
+        assert abs(np.mean(returns) - blackjack_exact.value(choose)) < 3.5 * error

@@ -26,6 +26,7 @@ from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.recipe.build import (
     build_q,
     build_session,
@@ -65,6 +66,8 @@ class Run:
         play_off: of a run that ended below its best evaluation, what that was decided by
             (`neuralq.runs.evaluation.play_off`); else None.
         exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
+        measured: what it learned that is no value of an action: of prediction the start's value and the distance from
+            exact values, of R-learning the reward per step; empty for others.
     """
 
     run_dir: Path
@@ -81,6 +84,7 @@ class Run:
     agent: str = "final"
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
+    measured: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -88,13 +92,15 @@ class Run:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
+        score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
         )
         lines = [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}",
+            *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
         ]
         if self.play_off is not None:
@@ -121,6 +127,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         agent=agent,
         play_off=play_off,
         exact=exact,
+        measured=session.measures(),
     )
 
 
@@ -218,10 +225,18 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
         num_episodes: how many episodes.
         seed: of the episodes; unrelated to those seen in training.
         best: True to play with the parameters whose greedy evaluation scored highest, False with the last.
+
+    Raises:
+        ValueError: if the run has learned no policy.
     """
     check_whole("num_episodes", num_episodes)
     check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
+    if not getattr(config.settings, "acts", True):
+        raise ValueError(
+            f"{run_dir} predicts and has no policy that could be played; its metrics have what it learned: "
+            f"neuralq report {run_dir}"
+        )
     agent = _load_agent(run_dir, best)
     with limited_threads(config.threads):
         envs = make_evaluation_envs(config, min(num_episodes, 64))
@@ -230,7 +245,8 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
             with torch.no_grad():
                 most = config.evaluation_max_steps or last_cap(run_dir)
                 found = evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
-            beside = Beside.of(envs, stream.spec, config.gamma, config.exact)
+            discounts = getattr(config.settings, "discounts", True)
+            beside = Beside.of(envs, stream.spec, config.gamma, config.exact) if discounts else None
             if beside is None:
                 return found
             beside.load_state_dict(checkpoint.load_newest(Path(run_dir) / "checkpoints").state.get("met"))
@@ -250,7 +266,8 @@ def last_cap(run_dir: str | Path) -> int:
 
 def _opening(config: RunConfig, session: Session) -> list[str]:
     warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
-    return [*opening_lines(session.stream), *warned]
+    told = [session.stream.told] if isinstance(session.stream, Playback) else []
+    return [*told, *opening_lines(session.stream), *warned]
 
 
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
@@ -266,11 +283,13 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
         notes.append(f"greedy {shown(latest['greedy_return'])}{goal}")
+    notes += [f"{name.replace('_', ' ')} {latest[name]:.3g}" for name in _MEASURES if name in latest]
     if latest.get("num_cut"):
         notes.append(f"{latest['num_cut']} of {len(latest['returns'])} evaluation episodes cut")
     return notes
 
 
+_MEASURES = ("value_error_rms", "average_reward")
 _CHANGEABLE = frozenset(
     "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
     "resume_probe exact monitor".split()

@@ -23,6 +23,7 @@ from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
@@ -56,7 +57,7 @@ class Session:
         beside: holds what is learned against the exact answer, where the environment has a model.
     """
 
-    stream: Interaction | TableWalk
+    stream: Interaction | TableWalk | Playback
     policy: Policy | None
     experience: ExperienceSource | None
     learner: Learner
@@ -265,17 +266,24 @@ class Session:
 
         An environment that can exist only once is not evaluated, which a warning says.
         """
+        measured = self.measures()
+        if not getattr(getattr(self.learner, "settings", None), "acts", True):
+            return measured, None
         if not self._can_evaluate():
-            return {}, None
+            return measured, None
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
-        columns |= self._beside_exact()
+        columns |= measured | self._beside_exact()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def measures(self) -> dict[str, float]:
+        """What a learner of something else than action values has learned; empty for others."""
+        return self.stream.measures() if isinstance(self.stream, TableWalk) else {}
 
     def _beside_exact(self) -> dict[str, Any]:
         """Columns on what is learned beside the exact answer."""
@@ -340,7 +348,7 @@ class Session:
         """The environments' own state; None where it cannot be taken, or no longer can."""
         if not self.resumability.exact:
             return None
-        if isinstance(self.stream, TableWalk) and self.stream.simulated:
+        if isinstance(self.stream, TableWalk | Playback) and self.stream.simulated:
             return {}
         try:
             return encode_env(self.stream.envs)

@@ -98,6 +98,8 @@ class EnvironmentWalk:
         self.masks: list[bytes | None] = [None] * len(learner.acting_table.q)
         self._scale = reward_scale
         self.running_return, self.num_taken = 0.0, 0
+        self.begun: dict[int, int] = {}
+        """How many episodes began in a state, since this walk was made."""
         self.recent = new_log(remembered, REPLAY)
         self._rows = [self.recent._replace(offset=row) for row in range(remembered)]
         self._nothing = empty_arrays()
@@ -199,7 +201,9 @@ class EnvironmentWalk:
         except (Exception, SystemExit) as error:
             raise WalkFault("reset") from error
         self._seed = None
-        return self._arrive(observation, extras, False)
+        s = self._arrive(observation, extras, False)
+        self.begun[s] = self.begun.get(s, 0) + 1
+        return s
 
     def _arrive(self, observation: Any, extras: Any, over: bool) -> int:
         """The state of an observation; the first sight of one tells which actions it has."""

@@ -196,6 +196,15 @@ class TabularLearner:
         self.engine.flat.load(torch.as_tensor(state["parameters"]))
         for array, values in zip(own, saved, strict=True):
             array[...] = values
+        self._take_parameters()
+
+    def _take_parameters(self) -> None:
+        """The parameters are what counts: a run may begin with those of another one."""
+        q = self.loop.table.q
+        np.copyto(q, self._entries[:, : q.shape[1]], where=q > -np.inf)
+        for copies in self.loop.copies:
+            changed = copies.mean(0) != q
+            copies[:, changed] = q[changed]
 
 
 def _table(q: Floats) -> Table:
@@ -269,4 +278,5 @@ TABULAR = LearnerKind(
     check=_check,
     layout="table",
     place=6,
+    step_sizes=("step_size", "power", "turn_visits"),
 )

@@ -57,7 +57,7 @@ class TabularSettings:
         schedule: of the step size α by visits n of a pair: "constant", "one-over-n" (1/n), "power" (1/n^ω) or
             "search-then-converge" (α / (1 + (n − 1)/τ)); none for the one whose α, ω or τ is set, else for power.
         step_size: α of "constant" (0.1) and of the first visits in "search-then-converge" (0.5).
-        power: ω of "power", in (0.5, 1] for convergence (0.65).
+        power: ω of "power", in (0.5, 1] for convergence (0.55; 0.5 with "double", 0.8 with "td-lambda").
         turn_visits: τ of "search-then-converge": the visits after which α falls as 1/n (100).
         policy: "epsilon-greedy" (ε of the run), "k-to-the-q" (Mitchell 13.3.5), "softmax", "ucb" (a bonus for pairs
             that were visited rarely) or "random"; none for epsilon-greedy, and random with "td-lambda".
@@ -147,6 +147,16 @@ class TabularSettings:
             )
 
     @property
+    def acts(self) -> bool:
+        """Whether what is learned says what to do; the values of states do not."""
+        return self.algorithm != "td-lambda"
+
+    @property
+    def discounts(self) -> bool:
+        """Whether discounted values of actions are learned, those that have an exact answer beside them in runs."""
+        return self.algorithm not in ("td-lambda", "r-learning")
+
+    @property
     def plan(self) -> dict[str, Any]:
         """Every setting with its value, those that nobody set with their defaults.
 
@@ -165,7 +175,7 @@ class TabularSettings:
 _DEFAULTS: dict[str, Any] = {
     "simulate": None,
     "schedule": "power",
-    "power": 0.65,
+    "power": 0.55,
     "turn_visits": 100.0,
     "policy": "epsilon-greedy",
     "k": 1.5,
@@ -183,9 +193,10 @@ _DEFAULTS: dict[str, Any] = {
     "beta": 0.01,
 }
 _OF_ALGORITHM: dict[str, dict[str, Any]] = {
+    "double": {"power": 0.5},
     "n-step": {"rule": "q-learning"},
     "q-lambda": {"rule": "watkins", "trace": "replacing"},
-    "td-lambda": {"policy": "random", "trace": "replacing"},
+    "td-lambda": {"policy": "random", "trace": "replacing", "power": 0.8},
     "r-learning": {"schedule": "constant"},
 }
 

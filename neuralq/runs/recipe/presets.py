@@ -176,6 +176,31 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         for game in _GAMES
         for learner in ("streaming", "gradient")
     },
+    # A card says little: α = 1/n averages over all of them, undiscounted, with every action taken now and then.
+    ("Blackjack-v1", "tabular"): {
+        "total_steps": 200_000,
+        "gamma": 1.0,
+        "epsilon_end": 0.1,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 50_000,
+        "evaluation_episodes": 200,
+        "tabular": {"schedule": "one-over-n"},
+    },
+    # The goal is rarely found on slippery ice: large steps as long as it is far away, then averages.
+    ("FrozenLake-v1", "tabular"): {
+        "epsilon_end": 0.1,
+        "evaluate_every": 20_000,
+        "evaluation_episodes": 100,
+        "tabular": {"schedule": "search-then-converge"},
+    },
+    ("FrozenLake8x8-v1", "tabular"): {
+        "total_steps": 500_000,
+        "epsilon_end": 0.1,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 100_000,
+        "evaluation_episodes": 100,
+        "tabular": {"schedule": "search-then-converge"},
+    },
     # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
     # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
     ("neuralq/MitchellGrid-v0", "rollout"): {

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
+from neuralq.exact import evaluate
 from neuralq.learners.learner import Learner, Update
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.mdp import FiniteMDP
@@ -27,7 +28,7 @@ from neuralq.tabular.kernels.acting import EPISODE_STEPS, LIMIT, RECORD, REPLAY,
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.prediction import under_policy
 from neuralq.tabular.walking import EnvironmentWalk, WalkFault, state_reader
-from neuralq.types import Array
+from neuralq.types import Array, Floats
 
 __all__ = ["TableWalk"]
 
@@ -63,7 +64,7 @@ class TableWalk:
         self._seed: int | None = seed
         try:
             observation, extras = env.reset(seed=seed)
-            self._read(observation)
+            self._first_state = self._read(observation)
             mask = legal_actions(env, extras)
         except WalkFault as fault:
             raise EnvironmentFault(f"at reset, {fault}") from fault
@@ -83,6 +84,7 @@ class TableWalk:
         self._broken = False
         self._return = 0.0
         self._ended: tuple[Episode, ...] = ()
+        self._exact_v: Floats | None = None
 
     @property
     def time_limit(self) -> int | None:
@@ -149,7 +151,7 @@ class TableWalk:
         model, terminal = self.mdp, self.mdp.is_terminal
         if learner.loop.acts_in is not None:
             shares = np.where(terminal[:, None], 0.0, legal / np.maximum(legal.sum(1, keepdims=True), 1))
-            model = under_policy(self.mdp, shares)
+            model = self._process = under_policy(self.mdp, shares)
         if learner.settings.algorithm == "r-learning" and compile_model(model).arrays.ends.any():
             raise ValueError(
                 "r-learning is for worlds that go on for ever, and episodes of this one end; use another algorithm"
@@ -207,6 +209,32 @@ class TableWalk:
         assert self._learner is not None
         known = self._num_recent if self.simulated else min(self._steps.num_taken, _REMEMBERED)
         return self._learner.errors(self.recent, known) if known else None
+
+    def measures(self) -> dict[str, float]:
+        """What was learned besides action values, in the environment's units.
+
+        Of TD(λ) the value of the start and, where a model tells the random policy's values, how far those are from
+        what was learned; of R-learning the reward per step.
+        """
+        learner = self._learner
+        assert learner is not None
+        if learner.average_reward is not None:
+            return {"average_reward": learner.average_reward}
+        if learner.settings.acts:
+            return {}
+        v = learner.loop.table.q[:, 0] / self._scale
+        if self.mdp is None:
+            begun = self._steps.begun
+            mean = np.average(v[list(begun)], weights=list(begun.values())) if begun else v[self._first_state]
+            return {"start_value": float(mean)}
+        start = self.mdp.start_distribution
+        found = {"start_value": float(start @ v)}
+        if self._exact_v is None:
+            self._exact_v = evaluate(self._process, np.zeros(len(v), np.int64), self.discount)
+        met = learner.loop.table.visits[:, 0] > 0
+        error = (v - self._exact_v)[met]
+        found["exact_start_value"] = float(start @ self._exact_v)
+        return found if not met.any() else found | {"value_error_rms": float(np.sqrt(np.mean(error**2)))}
 
     def met(self) -> tuple[Array, Array]:
         """Every pair that was visited, states as they are seen, with their masks."""
