@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from neuralq.q import TableQ as TableQ
     from neuralq.runs import Run as Run
     from neuralq.runs import RunConfig as RunConfig
+    from neuralq.runs import export as export
     from neuralq.runs import load as load
     from neuralq.runs import report as report
     from neuralq.runs import resume as resume
@@ -49,6 +50,7 @@ __all__ = [
     "Transition",
     "__version__",
     "exact",
+    "export",
     "lab",
     "learners",
     "load",
@@ -77,6 +79,7 @@ _HOMES = {
     "SeparateQ": "neuralq.q",
     "TableQ": "neuralq.q",
     "Transition": "neuralq.types",
+    "export": "neuralq.runs",
     "load": "neuralq.runs",
     "resume": "neuralq.runs",
     "solve": "neuralq.runs",

@@ -84,6 +84,10 @@ class DuelingQ(nn.Module):
         self.value = stream.trunk(width, num_atoms, 1, rng, dtype)
         self.advantage = stream.trunk(width, self.num_actions, 1, rng, dtype)
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``, or ``[*n, A·K]``."""
         rows, leading = self.input.rows(s)

@@ -91,6 +91,10 @@ class ActionOutputQ(nn.Module):
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, num_actions, 1, rng, dtype)
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
         rows, leading = self.input.rows(s)
@@ -128,6 +132,10 @@ class SeparateQ(nn.Module):
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, num_actions, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, 1, num_actions, rng, dtype)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
@@ -168,6 +176,10 @@ class ActionInputQ(nn.Module):
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features + num_actions, 1, 1, rng, dtype)
         self.register_buffer("one_hot", torch.eye(num_actions, dtype=dtype), persistent=False)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``, each state paired with every action at once."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from neuralq.runs.recipe.presets import preset_for, with_preset
 from neuralq.runs.recipe.stand_in import Maker, standing_in
 from neuralq.runs.stop_request import pass_on
 
-__all__ = ["load", "resume", "train"]
+__all__ = ["environment_of", "folder_of", "load", "resume", "train"]
 
 _makers: dict[Path, Maker] = {}
 """What makes the environments of this process's runs that no name leads to, by run folder."""
@@ -93,15 +95,36 @@ def _tell(hooks: Sequence[Hook], line: str) -> None:
     logging.getLogger("neuralq").info(line)
 
 
-def _maker(run: Path, env: Any) -> Maker | None:
-    """What makes the environments of a run: what is handed over now, or was when it began in this process."""
-    if env is None:
-        return _makers.get(run.resolve())
-    handed = handed_over(env)
-    if handed.make is None:
-        config = RunConfig(env=handed.env, env_kwargs=handed.env_kwargs)
-        return lambda: make_single(config.env, config.env_kwargs)
-    return handed.make
+@contextlib.contextmanager
+def environment_of(run: Path, env: Any = None) -> Iterator[None]:
+    """Within the block environments of a run that no name leads to are found.
+
+    Args:
+        run: its folder.
+        env: what is handed over now, as for `train`; None for what was when the run began in this process.
+    """
+    make = _makers.get(run.resolve())
+    if env is not None:
+        handed = handed_over(env)
+        make = handed.make or functools.partial(make_single, handed.env, handed.env_kwargs)
+    with standing_in(make):
+        yield
+
+
+def folder_of(run: Any) -> Path:
+    """The folder of a run, by its path, by what training returned or by an agent.
+
+    Raises:
+        ValueError: for anything else.
+
+    Example:
+        >>> folder_of("runs/demo").name
+        'demo'
+    """
+    found = getattr(run, "run_dir", run)
+    if not isinstance(found, str | Path):
+        raise ValueError(f"a run is named by its folder, what training returned or a loaded agent, got {run!r}")
+    return Path(found)
 
 
 def resume(
@@ -135,21 +158,16 @@ def resume(
         ValueError: for a new budget of a run that does not count environment steps, one that is spent already, and for
             changes that would make another run of it.
     """
-    path = _folder(run_dir)
+    path = folder_of(run_dir)
     kind = kind_of(path)
     if total_steps is not None and kind.budget != "total_steps":
         raise ValueError(
             f"{path} is {kind.title}, whose budget is {kind.budget} and not total_steps; leave it out here, or "
             "resume the run as its system does"
         )
-    with standing_in(_maker(path, env)):
+    with environment_of(path, env):
         run = kind.resume(path, total_steps, hooks, changes)
     return _passed_on(run)
-
-
-def _folder(run: Any) -> Path:
-    """The folder of a run, by its path or by what training returned."""
-    return Path(getattr(run, "run_dir", run))
 
 
 def _passed_on(run: Any) -> Any:
@@ -176,6 +194,6 @@ def load(run_dir: str | Path | Run, best: bool = False, *, env: Any = None) -> A
         CheckpointError: if no checkpoint is intact.
         ValueError: if the best is asked for of a run that keeps its newest only.
     """
-    path = _folder(run_dir)
-    with standing_in(_maker(path, env)):
+    path = folder_of(run_dir)
+    with environment_of(path, env):
         return kind_of(path).load(path, best)
