@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_choice
-from neuralq.q.bodies import ACTIVATIONS, Trunk
-from neuralq.q.engine import Engine, Loss, TorchEngine, check_actions, check_samples, check_single, no_target
+from neuralq.q.bodies import ACTIVATIONS, GroupedLinear, Trunk
+from neuralq.q.engine import Engine, Loss, TorchEngine, check_actions, check_samples, check_single, follow, no_target
 from neuralq.q.flat import FlatParameters
 from neuralq.q.kernels import batch as kernels
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
@@ -30,8 +30,8 @@ def runs_compiled(q: Any) -> bool:
     inner: Any = q.inner if type(q) is MaskedQ else q
     if type(inner) not in (ActionOutputQ, SeparateQ, ActionInputQ) or type(inner.trunk) is not Trunk:
         return False
-    # A stem has parameters, and so may a feature map of the user's: only autograd knows their gradient.
-    if any(True for _ in inner.input.parameters()):
+    # A stem has parameters, and so may a feature map of the user's: only autograd knows their gradient, and noise's.
+    if any(True for _ in inner.input.parameters()) or any(type(x) is not GroupedLinear for x in inner.trunk.layers):
         return False
     first: Tensor = next(inner.parameters())
     return first.device.type == "cpu" and first.dtype in (torch.float32, torch.float64)
@@ -175,12 +175,12 @@ class MlpEngine:
             check_actions(a, self._num_actions)
             self._mask.check_legal(s, a, weight)
 
-    def sync_target(self) -> None:
-        """Copy the parameters into the target copy."""
+    def sync_target(self, rate: float = 1.0) -> None:
+        """Move the target copy by this share of the way to the parameters; the first is a copy."""
         if self._target is None:
-            self._target = torch.empty_like(self.flat.values)
+            self._target = self.flat.values.clone()
             self._target_values = self._target.numpy()
-        self._target.copy_(self.flat.values)
+        follow(self._target, self.flat.values, rate)
 
     def target_values(self) -> Tensor | None:
         """The target copy's flat vector, or None."""

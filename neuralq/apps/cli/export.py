@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.sweeps import add_trust, single_run
+from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.runs import export as export_run
 from neuralq.runs.exporting.export import FORMATS, Exported
 
@@ -27,7 +27,7 @@ def export(argv: list[str]) -> int:
     parser.add_argument("--to", choices=FORMATS, help="which file (default: what the name of --out says, else torch)")
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: network.safetensors or .onnx)")
     parser.add_argument("--onnx", metavar="FILE", help="the same as --to onnx --out FILE")
-    parser.add_argument("--best", action="store_true", help="take the best parameters of the run, not the last")
+    add_which(parser)
     add_trust(parser)
     options = parser.parse_args(argv)
     to, out = options.to, options.out

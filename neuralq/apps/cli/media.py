@@ -15,7 +15,7 @@ import gymnasium as gym
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.film import caption, drawn, frame_rate, make_shown, picture, play, writers_for
 from neuralq.apps.cli.progress import ProgressBar, Told
-from neuralq.apps.cli.sweeps import add_trust, single_run
+from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.control import last_cap
 from neuralq.runs.folder.run_folder import read_config
@@ -100,7 +100,7 @@ def _add_options(parser: argparse.ArgumentParser, num_episodes: int) -> None:
     add("run", help="run folder")
     add("--episodes", type=int, default=num_episodes, metavar="N", help=f"how many (default: {num_episodes})")
     add("--seed", type=int, default=0, metavar="N", help="of the episodes (default: 0)")
-    add("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add_which(parser)
     add_trust(parser)
     add("--max-steps", type=int, metavar="N", help="cut an episode after so many (default: as in evaluations)")
 

@@ -65,6 +65,12 @@ class ReplaySettings:
         train_period: environment steps between updates.
         updates_per_period: updates at each of those times.
         target_period_updates: updates between copies into the target network; None for 500 (dqrc has none).
+        target_rate: τ in (0, 1]; in place of copies the target network moves by τ of the way at every update (Lillicrap
+            et al., 2016).
+        average_updates: greedy play is by an average of the parameters that forgets over about so many updates (Polyak
+            & Juditsky, 1992); None plays with the last.
+        noisy: whether the dense layers of a network are noisy, which explores by itself, so that ε may be 0 (Fortunato
+            et al., 2018).
         learning_rate: of the optimiser.
         optimiser: "adam", "radam" or "sgd".
         loss: "huber" or "squared"; None for the rule's own (Huber's; of dqrc squared, of categories cross-entropy).
@@ -93,6 +99,9 @@ class ReplaySettings:
     train_period: int = 1
     updates_per_period: int = 1
     target_period_updates: int | None = None
+    target_rate: float | None = None
+    average_updates: float | None = None
+    noisy: bool = False
     learning_rate: float = 5e-4
     optimiser: str = "adam"
     loss: str | None = None
@@ -156,7 +165,15 @@ class ReplaySettings:
             )
             what = rule if self.rule.correction else learned
             raise ValueError(f"loss={self.loss!r} does not go with {what}, which has {losses[0]!r}; leave loss out")
-        _settle(self, "target_period_updates", 500, not self.rule.correction, f"{rule} {self.rule.correction}")
+        why = f"{rule} {self.rule.correction}"
+        for name in ("target_rate", "average_updates"):
+            _settle(self, name, None, not self.rule.correction, why)
+        if self.noisy and self.rule.correction:
+            raise ValueError(f"noisy=True would be ignored by the second function of {rule}; leave noisy out")
+        if self.target_rate is not None:
+            why = f"target_rate={self.target_rate:g} moves the target network at every update"
+        copies = not self.rule.correction and self.target_rate is None
+        _settle(self, "target_period_updates", 500, copies, why)
         atoms = self.returns.num_atoms
         _settle(self, "num_atoms", atoms, atoms is not None, f"{learned} has no atoms")
         for name in ("value_min", "value_max"):
@@ -167,6 +184,10 @@ class ReplaySettings:
             _settle(self, name, default, name in own, f"{rule} {option.lack}")
 
     def _check_own_numbers(self) -> None:
+        if self.target_rate is not None and not 0 < self.target_rate <= 1:
+            raise ValueError(f"target_rate must lie in (0, 1], got {self.target_rate}; 0.005 is usual, 1 copies")
+        if self.average_updates is not None and not 1 <= self.average_updates < float("inf"):
+            raise ValueError(f"average_updates must be a finite number of at least 1, got {self.average_updates}")
         for name, least in (("target_period_updates", 1), ("num_atoms", self.returns.least_atoms)):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), least)

@@ -51,7 +51,7 @@ class Exported:
         return {**dataclasses.asdict(self), "path": str(self.path), "run_dir": str(self.run_dir)}
 
 
-def export(run: Any, path: str | Path, to: str | None = None, best: bool = False, *, env: Any = None) -> Exported:
+def export(run: Any, path: str | Path, to: str | None = None, best: bool | None = None, *, env: Any = None) -> Exported:
     """Write a run's network for other programs; the file is asked beside the original before it is kept.
 
     Args:
@@ -59,7 +59,7 @@ def export(run: Any, path: str | Path, to: str | None = None, best: bool = False
         path: the file to write.
         to: "torch", the state dict of a plain `nn.Sequential` as safetensors, with the lines that load it; or "onnx".
             By default what the file's name ends in says.
-        best: the parameters whose greedy evaluation scored highest, in place of the newest.
+        best: which parameters, as for `neuralq.load`.
         env: as for `neuralq.load`.
 
     Raises:

@@ -16,6 +16,7 @@ from neuralq.q import MLP
 from neuralq.rules import Linear
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.stream import Interaction, ObservationSpec
+from neuralq.runs.stream.table import TableWalk
 
 __all__ = ["num_updates", "require_room", "warnings_ahead"]
 
@@ -40,7 +41,7 @@ def num_updates(config: RunConfig) -> int:
     return config.total_steps
 
 
-def warnings_ahead(config: RunConfig, stream: Interaction) -> list[str]:
+def warnings_ahead(config: RunConfig, stream: Interaction | TableWalk) -> list[str]:
     """A line for each reason for which this run cannot learn what it is meant to; none for most runs.
 
     Example:
@@ -97,7 +98,7 @@ def _rate(config: RunConfig) -> str | None:
     )
 
 
-def _unused_masks(stream: Interaction) -> Iterator[str]:
+def _unused_masks(stream: Interaction | TableWalk) -> Iterator[str]:
     """Parts of an observation that are named as masks are, where no mask is told in the place that is obeyed."""
     for part in [] if stream.spec.masked else stream.encoder.parts:
         name = str(part.keys[-1]).lower() if part.keys else ""
