@@ -59,7 +59,8 @@ def test_keyword_arguments_are_fields_and_the_settings_of_the_learner() -> None:
     )
     assert (config.learner, config.total_steps, config.gamma, config.body) == ("replay", 100_000, 0.9, MLP((4,)))
     assert config.replay == ReplaySettings(lambda_=0.0, batch_size=8)
-    same = config_of({"env": "Unknown-v0", "learner": "replay", "replay": {"batch_size": 8}}, lambda_=0.0, gamma=0.9)
+    nested = {"env": "Unknown-v0", "learner": "replay", "replay": {"batch_size": 8}}
+    same = config_of(nested, False, lambda_=0.0, gamma=0.9)
     assert same.replay == config.replay
     whole = config_of(config, seed=3, batch_size=9)
     assert whole.seed == 3 and whole.replay == ReplaySettings(lambda_=0.0, batch_size=9) and whole.body == config.body

@@ -85,6 +85,7 @@ class ActionOutputQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
@@ -127,6 +128,7 @@ class SeparateQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
@@ -170,6 +172,7 @@ class ActionInputQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # known to type checkers
 if TYPE_CHECKING:
+    from neuralq.runs.api import evaluate as evaluate
     from neuralq.runs.api import load as load
     from neuralq.runs.api import resume as resume
     from neuralq.runs.api import train as train
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Run",
     "RunConfig",
+    "evaluate",
     "evaluate_run",
     "export",
     "load",
@@ -32,7 +34,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    **dict.fromkeys(("load", "resume", "train"), "neuralq.runs.api"),
+    **dict.fromkeys(("evaluate", "load", "resume", "train"), "neuralq.runs.api"),
     **dict.fromkeys(("Run", "evaluate_run"), "neuralq.runs.control"),
     "export": "neuralq.runs.exporting.export",
     "RunConfig": "neuralq.runs.recipe.config",

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuralq.runs.control import CONTROL, Run
+from neuralq.runs.control import CONTROL, Run, evaluate_run
+from neuralq.runs.evaluation import Evaluation
 from neuralq.runs.kinds import kind_of
 from neuralq.runs.loop import Hook, Listener
 from neuralq.runs.recipe.config import RunConfig, config_from_dict
@@ -20,7 +21,7 @@ from neuralq.runs.recipe.presets import of_agent, started, with_preset
 from neuralq.runs.recipe.stand_in import Maker, standing_in
 from neuralq.runs.stop_request import pass_on
 
-__all__ = ["environment_of", "folder_of", "load", "resume", "train"]
+__all__ = ["environment_of", "evaluate", "folder_of", "load", "resume", "train"]
 
 _makers: dict[Path, Maker] = {}
 """What makes the environments of this process's runs that no name leads to, by run folder."""
@@ -208,3 +209,36 @@ def load(run_dir: str | Path | Run, best: bool | None = None, *, env: Any = None
     path = folder_of(run_dir)
     with environment_of(path, env):
         return kind_of(path).load(path, best)
+
+
+def evaluate(
+    run: Any, num_episodes: int = 100, seed: int = 0, best: bool | None = None, *, env: Any = None
+) -> Evaluation:
+    """Returns of greedy episodes, played by the agent of a run in environments of their own.
+
+    Args:
+        run: a run, its folder, or an agent that was loaded from it.
+        num_episodes: how many episodes.
+        seed: of the episodes; unrelated to those seen in training.
+        best: which parameters, as for `load`.
+        env: as for `load`.
+
+    Raises:
+        ValueError: if ``run`` is none of these, or has learned no policy.
+        RunFolderError: if there is no run in the folder.
+
+    Example:
+        >>> import tempfile
+        >>> run = train("CartPole-v1", tempfile.mkdtemp() + "/run", total_steps=64, evaluation_episodes=1,
+        ...             num_envs=2, num_steps=16, hidden=(8,))
+        >>> len(evaluate(run, 5).returns)
+        5
+    """
+    if isinstance(num_episodes, bool) or not isinstance(num_episodes, int):
+        raise ValueError(
+            f"the second argument is how many episodes, got {num_episodes!r}; write neuralq.evaluate(run), or "
+            "neuralq.evaluate(run, env=...) for an environment that has no name"
+        )
+    path = folder_of(run)
+    with environment_of(path, env):
+        return evaluate_run(path, num_episodes, seed, best)
