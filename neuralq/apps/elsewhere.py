@@ -19,7 +19,9 @@ _INSTEAD = {
     **dict.fromkeys(("evaluate_policy", "test", "enjoy"), "neuralq.evaluate(agent)"),
     **dict.fromkeys(("QNetwork", "MlpPolicy", "Net", "MLP"), "neuralq.ActionOutputQ(4, 2)"),
     **dict.fromkeys(("set_random_seed", "seed", "set_seed"), 'neuralq.train("CartPole-v1", seed=1)'),
-    **dict.fromkeys(("PrioritizedReplayBuffer", "VectorReplayBuffer", "Collector"), "neuralq.ReplayBuffer(1000, (4,), np.float32)"),
+    **dict.fromkeys(
+        ("PrioritizedReplayBuffer", "VectorReplayBuffer", "Collector"), "neuralq.ReplayBuffer(1000, (4,), np.float32)"
+    ),
     "learn": "neuralq.train, and neuralq.resume(run, total_steps=...) to go on",
     "save": 'the run folder, where everything is saved; neuralq.export(run, "q.safetensors") writes the network alone',
     "value_iteration": 'neuralq.solve("FrozenLake-v1", method="value-iteration")',
