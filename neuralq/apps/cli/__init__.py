@@ -205,6 +205,8 @@ def _top(first: str) -> int:
         return 0
     close = difflib.get_close_matches(first, COMMANDS, 1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+    if re.search(r"-v\d+$", first):
+        hint = f"an environment goes with one, as in neuralq train {first}"
     print(f"neuralq: there is no command {first!r}; {hint} (neuralq --help)", file=sys.stderr)
     return 2
 
