@@ -9,8 +9,9 @@ docs/doctor.md says what is measured, where thresholds come from, and how far fi
 from __future__ import annotations
 
 from neuralq.doctor.examination import examine
-from neuralq.doctor.findings import Finding, Report
+from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
+from neuralq.doctor.report import Report
 from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.weights import CannotLoad
 

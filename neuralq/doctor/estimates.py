@@ -37,7 +37,7 @@ def bounds_of(
     """
     counts = rng.multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=_RESAMPLES)
     with np.errstate(all="ignore"):
-        drawn = statistic(counts @ np.asarray(sums, np.float64))
+        drawn = statistic(counts.astype(np.float64) @ np.asarray(sums, np.float64))
     kept = drawn[np.isfinite(drawn)]
     if not kept.size:
         return float("nan"), float("nan")
@@ -108,7 +108,9 @@ def _features(x: Array, rng: np.random.Generator) -> Floats:
     spread = x.std(0)
     scaled = np.clip((x - x.mean(0)) / np.where(spread > 1e-12, spread, 1.0), -5, 5)
     width = np.sqrt(max(scaled.shape[1], 1)) * 1.5
-    angles = scaled @ (rng.standard_normal((scaled.shape[1], _NUM_FEATURES)) / width) + rng.uniform(0, 2 * np.pi, _NUM_FEATURES)
+    angles = scaled @ (rng.standard_normal((scaled.shape[1], _NUM_FEATURES)) / width) + rng.uniform(
+        0, 2 * np.pi, _NUM_FEATURES
+    )
     made: Floats = np.concatenate([np.ones((len(x), 1)), scaled, np.cos(angles)], axis=1)
     return made
 

@@ -12,16 +12,17 @@ import torch
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
 from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
-from neuralq.doctor.findings import Finding, Report
+from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
 from neuralq.doctor.play import Clock, EnvironmentRaised, returns_from
+from neuralq.doctor.report import Report
 from neuralq.doctor.subject import Settings, Subject, with_settings
 from neuralq.doctor.tree import decide
 from neuralq.doctor.weights import CannotLoad, plain_bytes, read_arrays
 from neuralq.doctor.worlds import World, open_world
 from neuralq.types import Array
 
-__all__ = ["LEVELS", "examine"]
+__all__ = ["LEVELS", "NUM_PARTS", "examine"]
 
 LEVELS = ("exam",)
 
@@ -59,6 +60,8 @@ _MEASUREMENTS: dict[str, Measurement] = {
     "V6a": values.better_actions,
     "R5": network.plasticity,
 }
+NUM_PARTS = len(_MEASUREMENTS) + 2
+"""Of an examination: the measurements, and twice episodes are played."""
 
 
 def examine(
@@ -72,7 +75,7 @@ def examine(
     level: Literal["exam"] = "exam",
     budget_s: float = 60.0,
     seed: int = 0,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Callable[[int, str], None] | None = None,
 ) -> Report:
     """Why a value function is bad: the environment, the algorithm, the representation, the data, or luck.
 
@@ -90,7 +93,7 @@ def examine(
         level: ``"exam"`` measures.
         budget_s: seconds for all of it.
         seed: of every draw.
-        progress: told how many measurements are through, of how many, and what comes next.
+        progress: told how many of `NUM_PARTS` parts are through, and what comes next.
 
     Raises:
         CannotLoad: the subject cannot be rebuilt, or does not fit the environment.
@@ -116,7 +119,7 @@ def examine(
     world = open_world(given)
     columns = _columns(data)
     _check_fits(loaded, world)
-    say = _Teller(progress, len(_MEASUREMENTS) + 2)
+    say = _Teller(progress)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches: threads would only wait for each other
     try:
@@ -128,12 +131,12 @@ def examine(
 class _Teller:
     """Counts what is through."""
 
-    def __init__(self, progress: Callable[[int, int, str], None] | None, total: int) -> None:
-        self.progress, self.total, self.so_far = progress, total, 0
+    def __init__(self, progress: Callable[[int, str], None] | None) -> None:
+        self.progress, self.so_far = progress, 0
 
     def __call__(self, text: str) -> None:
         if self.progress is not None:
-            self.progress(min(self.so_far, self.total), self.total, text)
+            self.progress(min(self.so_far, NUM_PARTS), text)
         self.so_far += 1
 
 
@@ -166,7 +169,9 @@ def _measured(case: Case, say: _Teller) -> tuple[list[Finding], dict[str, str]]:
         except CannotMeasure as reason:
             missing[name] = str(reason)
         except (RuntimeError, ValueError, np.linalg.LinAlgError, NotImplementedError) as error:
-            missing[name] = f"it failed: {type(error).__name__}: {str(error).splitlines()[0][:200] if str(error) else ''}"
+            missing[name] = (
+                f"it failed: {type(error).__name__}: {str(error).splitlines()[0][:200] if str(error) else ''}"
+            )
     return measured, missing
 
 
@@ -215,7 +220,8 @@ def _check_fits(subject: Subject, world: World) -> None:
         ) from error
     if shape != (2, world.num_actions):
         raise CannotLoad(
-            f"there are {shape[-1]} action values for an observation, and {world.name} has {world.num_actions} actions; "
+            f"there are {shape[-1]} action values for an observation, and {world.name} has {world.num_actions} "
+            f"actions; "
             "name the environment it was trained in with --env"
         )
     if subject.first_action not in (None, world.first_action):

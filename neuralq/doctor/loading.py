@@ -51,4 +51,6 @@ def load_subject(given: Any, net: str | None = None) -> Subject:
         if origin.recognises(path):
             return origin.load(path, net)
     known = "; ".join(origin.name for origin in ORIGINS)
-    raise CannotLoad(f"{path} is none of: {known}. From PyTorch: {EXPORT.splitlines()[1]}, read with --net module:Class")
+    raise CannotLoad(
+        f"{path} is none of: {known}. From PyTorch: {EXPORT.splitlines()[1]}, read with --net module:Class"
+    )

@@ -48,9 +48,9 @@ def under(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:
 
 
 def stack(state: Mapping[str, Tensor], what: str, activation: type[nn.Module] = nn.ReLU) -> nn.Sequential:
-    """The `nn.Sequential` whose layers have these weights: ``0.weight``, ``0.bias``, ``2.weight``, …
+    """The `nn.Sequential` whose layers have these weights: ``0.weight``, ``0.bias``, ``2.weight``.
 
-    A number without weights is an activation; where dense layers follow convolutions, the last one before them flattens.
+    A number without weights is an activation; the last one before dense layers that follow convolutions flattens.
 
     Args:
         state: its weights.
@@ -72,7 +72,9 @@ def stack(state: Mapping[str, Tensor], what: str, activation: type[nn.Module] = 
     for key, value in state.items():
         match = re.fullmatch(r"(\d{1,3})\.(weight|bias)", key)
         if match is None:
-            raise CannotLoad(f"{what} has a key {key!r}, which is no layer of a plain stack (0.weight, 0.bias, …); {_WAY_OUT}")
+            raise CannotLoad(
+                f"{what} has a key {key!r}, which is no layer of a plain stack (0.weight, 0.bias, …); {_WAY_OUT}"
+            )
         if match[2] == "weight":
             numbers[int(match[1])] = value
     if not numbers:
@@ -88,7 +90,8 @@ def stack(state: Mapping[str, Tensor], what: str, activation: type[nn.Module] = 
             layers[-1] = nn.Flatten()
         layers.append(_layer(weight, f"{number}.bias" in state, f"{what}: {number}.weight", before))
         before = weight if weight.dim() > 1 else before
-    return fill(nn.Sequential(*layers), state, what)
+    made: nn.Sequential = fill(nn.Sequential(*layers), state, what)
+    return made
 
 
 def _layer(weight: Tensor, bias: bool, what: str, before: Tensor | None) -> nn.Module:
@@ -118,7 +121,9 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], what: str) -> Any:
             raise CannotLoad(f"{what} has the key {key!r}, which {type(module).__name__} lacks; {_WAY_OUT}")
         if state[key].shape != own[key].shape:
             got, wanted = list(state[key].shape), list(own[key].shape)
-            raise CannotLoad(f"{what}: {key!r} has the shape {got}, and {type(module).__name__} has {wanted}; {_WAY_OUT}")
+            raise CannotLoad(
+                f"{what}: {key!r} has the shape {got}, and {type(module).__name__} has {wanted}; {_WAY_OUT}"
+            )
     with torch.no_grad():
         module.load_state_dict({key: value.detach().clone() for key, value in state.items()})
     return module.eval()

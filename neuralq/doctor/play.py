@@ -140,7 +140,10 @@ def play(
     """
     lift = world.liftable and past_limit > 0
     limit = world.limit or most_steps
-    size = int(np.prod(world.observation_space.shape or (1,))) * (world.observation_space.dtype or np.dtype(float)).itemsize
+    size = (
+        int(np.prod(world.observation_space.shape or (1,)))
+        * (world.observation_space.dtype or np.dtype(float)).itemsize
+    )
     most_in_all = min(most_in_all, max(2048, _MOST_BYTES // size))
     envs = [world.lifted() if lift else world.make() for _ in range(num_episodes)]
     rng, until = np.random.default_rng(seed), time.monotonic() + seconds
@@ -193,7 +196,8 @@ class _Running:
 
     def episode(self, limit: int) -> Episode:
         return Episode(
-            np.stack(self.observations), np.array(self.actions, np.int64), np.array(self.rewards), np.stack(self.values),
+            np.stack(self.observations), np.array(self.actions, np.int64), np.array(self.rewards),
+            np.stack(self.values),
             self.terminated, self.truncated, min(len(self.actions), limit),
         )  # fmt: skip
 

@@ -177,7 +177,7 @@ def of_network(
         with torch.no_grad():
             for begin in range(0, len(observations), _AT_ONCE):
                 found.append(outputs(network, encode(observations[begin : begin + _AT_ONCE])).double().cpu().numpy())
-        return cast(Floats, np.concatenate(found) / scale)
+        return np.concatenate(found) / scale
 
     return Subject(origin, values, known, network, encode, outputs, target, first_action, num_actions, env)
 

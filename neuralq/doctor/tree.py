@@ -4,7 +4,8 @@
 2. A faulty environment (E1, E3, E6) makes everything else conditional.
 3. A policy that has learned (V1) and whose values are right (V2, V4) is healthy: what else is beyond its threshold is a
    vital sign and no verdict. Mistakes that can be seen in the data or the exact answer stay what they are.
-4. Else causes come before symptoms: what the weights, data and scales say, then how far values can see, then which mistake
+4. Else causes come before symptoms: what the weights, data and scales say, then how far values can see,
+then which mistake
    would make them right, and last that they are wrong.
 """
 
@@ -93,4 +94,3 @@ def _headline(flagged: Sequence[Finding], by_id: Mapping[str, Finding]) -> str:
         )
     rest = " Everything else is conditional on that." if first.cause == "environment" and len(named) > 1 else ""
     return f"{first.cause.capitalize()}: {first.title} ({first.id}, grade {first.grade}).{rest}"
-

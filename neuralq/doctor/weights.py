@@ -69,7 +69,9 @@ def plain_bytes(path: Path) -> bytes:
     """
     try:
         if path.stat().st_size > 4 * _MOST_BYTES:
-            raise CannotLoad(f"{path} has {path.stat().st_size:,} bytes, more than the 4 GiB that are read; export less")
+            raise CannotLoad(
+                f"{path} has {path.stat().st_size:,} bytes, more than the 4 GiB that are read; export less"
+            )
         return read_regular(path)
     except (OSError, RunFolderError) as error:
         raise CannotLoad(f"cannot read {path}: {error}; give the path of a saved agent") from error
@@ -143,7 +145,8 @@ def read_state(raw: bytes, what: str) -> dict[Any, Any]:
     """
     if not raw.startswith(b"PK"):
         raise CannotLoad(
-            f"{what} is no archive as torch.save writes one since 1.6 (a bare pickle runs code when it is read); load it "
+            f"{what} is no archive as torch.save writes one since 1.6 (a bare pickle runs code when it is read); "
+            f"load it "
             f"where you trust it, and save: {_one_line()}"
         )
     members = read_members(raw, _of_tensors, what)
@@ -183,7 +186,9 @@ def _check_program(program: bytes, what: str) -> None:
                     f"run code; where you trust it, save its weights alone: {_one_line()}"
                 )
             if opcode.name in _REFUSED_OPCODES:
-                raise CannotLoad(f"{what} has the pickle instruction {opcode.name}, which weights need not; {_one_line()}")
+                raise CannotLoad(
+                    f"{what} has the pickle instruction {opcode.name}, which weights need not; {_one_line()}"
+                )
             if isinstance(argument, int) and opcode.name.startswith(("BININT", "LONG", "INT")) and argument >= 2**40:
                 raise CannotLoad(f"{what} holds a tensor of {argument:,} entries, more than any network has; refused")
     except CannotLoad:
@@ -206,7 +211,8 @@ def _check_sizes(state: Mapping[Any, Any], what: str, depth: int = 3) -> None:
     for key, value in state.items():
         if isinstance(value, Tensor) and value.numel() > min(MOST_ENTRIES, _stored(value)):
             raise CannotLoad(
-                f"{what}: {key!r} says that it has {value.numel():,} entries, and the file holds {_stored(value):,}; refused"
+                f"{what}: {key!r} says that it has {value.numel():,} entries, and the file holds "
+                f"{_stored(value):,}; refused"
             )
         if isinstance(value, Mapping) and depth:
             _check_sizes(value, f"{what}: {key!r}", depth - 1)

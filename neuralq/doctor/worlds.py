@@ -109,7 +109,8 @@ def open_world(env: Any) -> World:
         space = first.observation_space
         if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
             raise ValueError(
-                f"observations must be of a Box or Discrete space, got {type(space).__name__}; wrap the environment with "
+                f"observations must be of a Box or Discrete space, got {type(space).__name__}; wrap the environment "
+                f"with "
                 "gymnasium.wrappers.FlattenObservation"
             )
         found, spec = _limit_of(first), first.spec

@@ -44,7 +44,8 @@ def aliasing(case: Case) -> Finding:
         "E6", "observations hide part of the state", "environment", "B", gain, (low, high), _THRESHOLD,
         "our own, of CartPole, Acrobot and MountainCar with and without velocities", low > _THRESHOLD, said,
         "give the agent what is hidden: velocities, or the last observations stacked (FrameStackObservation)",
-        "env = gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FrameStackObservation(env, 2))  # and train again",
+        "env = gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FrameStackObservation(env, 2))  # and train "
+        "again",
     )  # fmt: skip
 
 

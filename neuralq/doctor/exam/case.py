@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -64,9 +65,14 @@ class Case:
         """Of every policy."""
         return [*self.greedy, *self.explored, *self.chance, *(one for all_ in self.constant.values() for one in all_)]
 
+    @cached_property
+    def chance_valued(self) -> list[Episode]:
+        """The random episodes with what the subject says of their observations."""
+        return [replace(one, values=self.subject.values(one.observations[:-1])) for one in self.chance]
+
     @property
     def largest_reward(self) -> float:
-        """max |r| seen."""
+        """Max |r| seen."""
         return max((float(np.abs(one.rewards).max()) for one in self.episodes), default=0.0)
 
     @property

@@ -19,7 +19,8 @@ from neuralq.types import Floats
 __all__ = ["contract", "determinism", "disguised_limit", "observation_scale", "reward_scale"]
 
 _CONFIRM_CHECK = (
-    "from gymnasium.utils.env_checker import check_env\nimport gymnasium as gym\ncheck_env(gym.make({name!r}).unwrapped)"
+    "import gymnasium as gym\nfrom gymnasium.utils.env_checker import check_env\n"
+    "check_env(gym.make({name!r}).unwrapped)"
 )
 
 
@@ -88,7 +89,8 @@ def determinism(case: Case) -> Finding:
         seen.append(trace)
     same = seen[0] == seen[1]
     return Finding(
-        "E2", "the seed does not decide what happens", "environment", "C", float(not same), None, 0.5, "bit-equal or not",
+        "E2", "the seed does not decide what happens", "environment", "C", float(not same), None, 0.5,
+        "bit-equal or not",
         not same,
         f"two runs of one seed and the same 200 actions were {'the same' if same else 'different'}, bit for bit",
         "draw every random number from self.np_random, which reset(seed=...) seeds",
@@ -115,7 +117,8 @@ def disguised_limit(case: Case) -> Finding:
     auc = _told_apart(case, [one for _, one in at][:60], longest)
     said = (
         f"{len(at)} of the {len(near)} longest episodes ended by `terminated` at step {longest} exactly, under several "
-        f"policies, and their last observations look like those before (AUC {auc:.2f}): a time limit that is reported as "
+        f"policies, and their last observations look like those before (AUC {auc:.2f}): a time limit that is "
+        f"reported as "
         "the end of the world"
     )
     return _limit_finding(share, auc, longest, said)
@@ -124,7 +127,8 @@ def disguised_limit(case: Case) -> Finding:
 def _limit_finding(share: float, auc: float, longest: int, said: str) -> Finding:
     return Finding(
         "E3", "a time limit is reported as termination", "environment", "B", auc, None, 0.7,
-        "Pardo et al. 2018; share of ends at one step ≥ 0.9 and AUC < 0.7 are our own", share >= 0.9 and auc < 0.7, said,
+        "Pardo et al. 2018; share of ends at one step ≥ 0.9 and AUC < 0.7 are our own", share >= 0.9 and auc < 0.7,
+        said,
         "return truncated=True at the limit, or leave it to gymnasium.make(..., max_episode_steps=N)",
         f"env.reset(); print([env.step(env.action_space.sample())[2:4] for _ in range({max(longest, 1)})][-1])",
     )  # fmt: skip
@@ -156,7 +160,9 @@ def observation_scale(case: Case) -> Finding:
     spread = x.std(0)
     moving = spread[spread > 1e-9 * max(float(spread.max()), 1e-300)]
     ratio = float(moving.max() / moving.min()) if moving.size else 1.0
-    said = f"99 % of the entries of observations lie below {large:.3g}, and their spreads differ by a factor {ratio:.3g}"
+    said = (
+        f"99 % of the entries of observations lie below {large:.3g}, and their spreads differ by a factor {ratio:.3g}"
+    )
     return Finding(
         "E4", "observations are badly scaled", "representation", "C", large, None, 10.0,
         "RLDebugger's ±10, and a ratio of spreads of 100", bool(large > 10 or ratio > 100), said,
@@ -171,9 +177,13 @@ def reward_scale(case: Case) -> Finding:
     bound = most / (1 - case.gamma) if case.gamma < 1 else most * max(one.length for one in case.episodes)
     random: Floats = np.concatenate([one.rewards for one in case.chance])
     dense = float((random != 0).mean())
-    said = f"the largest |reward| is {most:.4g}, so that values can reach {bound:.4g}; {100 * dense:.3g} % of random steps pay"
+    said = (
+        f"the largest |reward| is {most:.4g}, so that values can reach {bound:.4g}; {100 * dense:.3g} % of random "
+        "steps pay"
+    )
     return Finding(
-        "E5", "rewards are badly scaled" if dense >= 0.001 else "rewards are sparse", "environment", "C", bound, None, 100.0,
+        "E5", "rewards are badly scaled" if dense >= 0.001 else "rewards are sparse", "environment", "C", bound, None,
+        100.0,
         "van Hasselt et al. 2018 assume |r| ≤ 1", bool(bound > 100 * (1 + 1e-9) or dense < 0.001), said,
         "scale rewards to at most 1: gymnasium.wrappers.TransformReward, VecNormalize, or reward_scale in neuralq"
         if dense >= 0.001 else "explore longer, or give rewards on the way (potential-based, Ng et al. 1999)",

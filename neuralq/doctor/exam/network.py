@@ -117,7 +117,7 @@ def _hook_trunk(trunk: Trunk, keep: Any) -> list[Any]:
 
 
 def dormant(case: Case) -> Finding:
-    """R1: the share of units with s_i = E|h_i| / mean_k E|h_k| ≤ 0.025 (Sokar et al. 2023), beyond that of fresh networks."""
+    """R1: the share of units with s_i = E|h_i| / mean_k E|h_k| ≤ 0.025 (Sokar et al. 2023), above a fresh network's."""
     network, x = _network(case), _encoded(case, _NUM_STATES, 21)
     own = _dormant(hidden(case, network, x))
     rng = case.rng(22)
@@ -128,7 +128,8 @@ def dormant(case: Case) -> Finding:
         "R1", "most units have gone silent: the step size is too large", "algorithm", "B", excess, interval, 0.5,
         "Sokar et al. 2023 for τ = 0.025; the excess over fresh networks is our own", interval[0] > 0.5,
         f"{100 * own:.0f} % of hidden units hardly answer, and {100 * others.mean():.0f} % in fresh networks",
-        "a step size ten times smaller; LayerNorm", f"train again with lr = {(case.settings.learning_rate or 1e-3) / 10:.2g}",
+        "a step size ten times smaller; LayerNorm", f"train again with lr = "
+                                                    f"{(case.settings.learning_rate or 1e-3) / 10:.2g}",
     )  # fmt: skip
 
 
@@ -150,7 +151,8 @@ def effective_rank(case: Case) -> Finding:
     others = [_srank(hidden(case, fresh(network, rng), x)[-1]) for _ in range(_NUM_FRESH)]
     return Finding(
         "R2", "the last hidden layer spans few directions", "representation", "C", float(own),
-        (float(min(others)), float(max(others))), 3.0, "none that is stable (Gulcehre et al. 2022); beside fresh networks",
+        (float(min(others)), float(max(others))), 3.0, "none that is stable (Gulcehre et al. 2022); beside fresh "
+                                                       "networks",
         own <= 3 and own < min(others),
         f"the effective rank of the last hidden layer is {own}, of fresh networks {min(others)} to {max(others)}",
         "a sign that values diverged, or that the network is too small", "watch it while training again",
@@ -215,7 +217,7 @@ def kernel(case: Case) -> Finding:
 
 
 def churn(case: Case) -> Finding:
-    """R4: after one Adam step on 32 transitions, the share of other states whose greedy action changes (Schaul 2022)."""
+    """R4: in which share of other states the greedy action changes by one Adam step (Schaul et al. 2022)."""
     network = copy.deepcopy(_network(case))
     x = _encoded(case, _NUM_STATES, 26)
     with torch.no_grad():
@@ -226,7 +228,8 @@ def churn(case: Case) -> Finding:
     with torch.no_grad():
         target = step.r_t + step.discount_t * values.all(step.s_t).amax(1)
     optimiser = torch.optim.Adam(network.parameters(), lr=rate)
-    nn.functional.mse_loss(values.at(step.s_tm1, step.a_tm1), target.to(before.dtype)).backward()
+    loss = nn.functional.mse_loss(values.at(step.s_tm1, step.a_tm1), target.to(before.dtype))
+    torch.autograd.backward(loss)
     optimiser.step()
     with torch.no_grad():
         after = _outputs(case, network, x)
@@ -234,7 +237,8 @@ def churn(case: Case) -> Finding:
     change = float((before - after).abs().mean())
     return Finding(
         "R4", "one update changes the policy elsewhere", "algorithm", "C", moved, None, 0.1, "our own", moved > 0.1,
-        f"one Adam step of size {rate:g} on 32 transitions changes the greedy action in {100 * moved:.2g} % of other states, "
+        f"one Adam step of size {rate:g} on 32 transitions changes the greedy action in {100 * moved:.2g} % of "
+        f"other states, "
         f"and values by {change:.3g}",
         "a smaller step size, larger batches", f"train again with lr = {rate / 10:.2g}",
     )  # fmt: skip
@@ -251,7 +255,8 @@ def plasticity(case: Case) -> Finding:
     own, other = (_fitted(case, copy.deepcopy(net), x, target) for net in (network, fresh(network, rng)))
     ratio = own / max(other, 1e-12)
     return Finding(
-        "R5", "the network has lost its plasticity", "representation", "C", ratio, None, 1.5, "our own; Lyle et al. 2023",
+        "R5", "the network has lost its plasticity", "representation", "C", ratio, None, 1.5, "our own; Lyle et al. "
+        "2023",
         ratio > 1.5, f"on a new target it ends at an error of {own:.3g}, a fresh one at {other:.3g}",
         "LayerNorm, weight decay, or resets", "train a fresh network on the same data, and compare",
     )  # fmt: skip
@@ -262,7 +267,7 @@ def _fitted(case: Case, network: nn.Module, x: Tensor, target: Tensor) -> float:
     for _ in range(500):
         optimiser.zero_grad()
         error = nn.functional.mse_loss(_outputs(case, network, x), target)
-        error.backward()
+        torch.autograd.backward(error)
         optimiser.step()
     return float(error.detach())
 
@@ -273,7 +278,8 @@ def lag(case: Case) -> Finding:
     if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
         return Finding(
             "R6", "the weights are not finite", "algorithm", "B", float("nan"), None, 0.5, "any", True,
-            "some weights are NaN or infinite", "a smaller step size, and gradients clipped", "train again with lr / 10",
+            "some weights are NaN or infinite", "a smaller step size, and gradients clipped", "train again with lr "
+            "/ 10",
         )  # fmt: skip
     if case.subject.target is None:
         raise CannotMeasure("the file holds no target network")

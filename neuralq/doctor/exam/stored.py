@@ -1,6 +1,7 @@
 """D1–D5: the experience that was learned from.
 
-Columns of the ``.npz``: ``obs, action, reward, terminated, truncated, next_obs`` in the order of time, one environment's
+Columns of the ``.npz``: ``obs, action, reward, terminated, truncated, next_obs`` in the order of time,
+one environment's
 rows after each other; ``age`` where rows are not in that order.
 """
 
@@ -110,7 +111,8 @@ def window(case: Case) -> Finding:
     few = episodes < 10 or spans < 3
     return Finding(
         "D3", "the buffer holds too little", "data", "B", spans, None, 3.0, "our own: 10 episodes and 3 horizons", few,
-        f"the buffer holds {rows:,.0f} steps, some {episodes:,.0f} episodes and {spans:,.1f} times as long as rewards matter",
+        f"the buffer holds {rows:,.0f} steps, some {episodes:,.0f} episodes and {spans:,.1f} times as long as "
+        f"rewards matter",
         "a larger buffer: 10,000 steps and more", f"neuralq train {case.world.name} --learner replay --capacity 50000",
     )  # fmt: skip
 
@@ -124,7 +126,9 @@ def actions_taken(case: Case) -> Finding:
         counts = np.bincount(np.clip(index, 0, num - 1), minlength=num)
         said, grade = "in the data", "B"
     elif case.settings.epsilon_start == 0 and case.settings.epsilon_end == 0:
-        return _exploration("B", 1.0, "the settings say ε = 0 from first to last: nothing but the greedy action was ever tried")
+        return _exploration(
+            "B", 1.0, "the settings say ε = 0 from first to last: nothing but the greedy action was ever tried"
+        )
     else:
         counts = np.bincount(np.concatenate([one.actions for one in case.greedy]), minlength=num)
         said, grade = "in greedy episodes", "C"
@@ -132,7 +136,11 @@ def actions_taken(case: Case) -> Finding:
     most = float(share.max())
     kept = share[share > 0]
     entropy = float(-(kept * np.log(kept)).sum() / np.log(num)) if num > 1 else 1.0
-    return _exploration(grade, most, f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most")
+    return _exploration(
+        grade,
+        most,
+        f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most",
+    )
 
 
 def _exploration(grade: Grade, most: float, said: str) -> Finding:

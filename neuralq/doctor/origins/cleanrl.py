@@ -35,7 +35,9 @@ def of_state(state: Mapping[Any, Any], path: Path) -> Subject:
         raise CannotLoad(f"{path}: model_weights must be a state dict, got {type(weights).__name__}")
     foreign = [key for key in weights if not str(key).startswith("network.") and key != "atoms"]
     if foreign:
-        raise CannotLoad(f"{path} has the key {foreign[0]!r}, which CleanRL's DQN and C51 lack; pass --net module:Class")
+        raise CannotLoad(
+            f"{path} has the key {foreign[0]!r}, which CleanRL's DQN and C51 lack; pass --net module:Class"
+        )
     layers = under(weights, "network.")
     network: nn.Module = stack(layers, f"{path}: network")
     first = next(iter(network.children()))

@@ -89,7 +89,9 @@ def _field(told: Mapping[str, Any], name: str, key: str, default: Any = None) ->
 
 def _whole(value: Any, name: str, path: Path) -> int:
     if not re.fullmatch(r"-?\d{1,9}", str(value)):
-        raise CannotLoad(f"{path}: {name} must be a whole number, got {str(value)[:40]!r}; the doctor takes Discrete actions")
+        raise CannotLoad(
+            f"{path}: {name} must be a whole number, got {str(value)[:40]!r}; the doctor takes Discrete actions"
+        )
     return int(value)
 
 
@@ -106,10 +108,18 @@ def _network(state: dict[str, Tensor], head: str, told: Mapping[str, Any], what:
         return dense
     frames, flat = under(rest, "features_extractor.cnn."), under(rest, "features_extractor.linear.")
     if len(frames) + len(flat) < len(rest) or not frames or not flat:
-        raise CannotLoad(f"{what} has the key {next(iter(rest))!r}, which is no NatureCNN; export the state dict and pass --net")
-    scaled = told.get("policy_kwargs", {}).get("normalize_images", True) if isinstance(told.get("policy_kwargs"), dict) else True
+        raise CannotLoad(
+            f"{what} has the key {next(iter(rest))!r}, which is no NatureCNN; export the state dict and pass --net"
+        )
+    scaled = (
+        told.get("policy_kwargs", {}).get("normalize_images", True)
+        if isinstance(told.get("policy_kwargs"), dict)
+        else True
+    )
     convolutions = nn.Sequential(*stack(frames, f"{what}: cnn", nn.ReLU), nn.ReLU())
-    return FromFrames(convolutions, nn.Sequential(*stack(flat, f"{what}: linear"), nn.ReLU()), dense, 255.0 if scaled else 1.0)
+    return FromFrames(
+        convolutions, nn.Sequential(*stack(flat, f"{what}: linear"), nn.ReLU()), dense, 255.0 if scaled else 1.0
+    )
 
 
 def _mean_of_quantiles(num_actions: int) -> Any:

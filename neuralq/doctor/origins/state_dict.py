@@ -1,4 +1,4 @@
-"""Weights alone: a state dict of PyTorch, ``.safetensors`` or ``.npz``, with the class they belong to or a plain stack."""
+"""Weights alone: a state dict of PyTorch, ``.safetensors`` or ``.npz``, of a class or a plain stack."""
 
 from __future__ import annotations
 
@@ -28,7 +28,11 @@ def _load(path: Path, net: str | None) -> Subject:
     if path.suffix == ".safetensors":
         state = read_safetensors(raw, what)
     elif path.suffix == ".npz":
-        state = {name: torch.from_numpy(array) for name, array in read_arrays(raw, what).items() if array.dtype.kind in "fiub"}
+        state = {
+            name: torch.from_numpy(array)
+            for name, array in read_arrays(raw, what).items()
+            if array.dtype.kind in "fiub"
+        }
     else:
         state = read_state(raw, what)
     if net is None and ("model_weights" in state or any(str(key).startswith("network.") for key in state)):
@@ -37,7 +41,8 @@ def _load(path: Path, net: str | None) -> Subject:
     if len(tensors) < len(state):
         other = next(key for key, value in state.items() if not isinstance(value, Tensor))
         raise CannotLoad(
-            f"{what}: {other!r} is no tensor, so this is no state dict; if it is a checkpoint, save the part that is one: "
+            f"{what}: {other!r} is no tensor, so this is no state dict; if it is a checkpoint, save the part that "
+            f"is one: "
             "torch.save(checkpoint['model'], 'weights.pth')"
         )
     if net is not None:
@@ -56,7 +61,9 @@ def _made(net: str) -> nn.Module:
     """The user's own network: "module:Class", called without arguments. Its code is theirs, and they named it."""
     module, colon, name = net.partition(":")
     if not colon:
-        raise CannotLoad(f"--net must be 'module:Class', got {net!r}; a class or function that is called without arguments")
+        raise CannotLoad(
+            f"--net must be 'module:Class', got {net!r}; a class or function that is called without arguments"
+        )
     try:
         check_module_name("the network", module, net)
         found: Any = importlib.import_module(module)
@@ -65,7 +72,8 @@ def _made(net: str) -> nn.Module:
         made = found()
     except Exception as error:
         raise CannotLoad(
-            f"cannot make the network {net!r}: {type(error).__name__}: {error}; --net names a class or function that is "
+            f"cannot make the network {net!r}: {type(error).__name__}: {error}; --net names a class or function "
+            f"that is "
             "called without arguments"
         ) from error
     if not isinstance(made, nn.Module):
