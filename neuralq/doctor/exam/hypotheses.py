@@ -58,14 +58,15 @@ def hypotheses(case: Case) -> Finding:
     right = math.sqrt(errors[_CORRECT].sum() / count.sum())
     rmse = {one.name: math.sqrt(errors[one.name].sum() / count.sum()) for one in made}
     order = sorted(made, key=lambda one: rmse[one.name])
-    best, alike = _told_apart(case, order, rmse)
+    best, alike = _told_apart(case, order, rmse, 0.02 * right)
     sums = np.column_stack([errors[best.name], errors[_CORRECT], count])
 
     def difference(s: Floats) -> Floats:
         return np.asarray(np.sqrt(s[:, 0] / s[:, 2]) - np.sqrt(s[:, 1] / s[:, 2]))
 
     low, high = bounds_of(sums, difference, case.rng(13))
-    clear, far, scale = rmse[best.name] < _BETTER * right and high < 0, _sees_far(case), max(right, 1e-12)
+    better = _BETTER if best.family != "scale" else _BETTER / 2  # it has a number of its own to fit
+    clear, far, scale = rmse[best.name] < better * right and high < 0, _sees_far(case), max(right, 1e-12)
     said = f"values differ from what was returned by {right:.3g}, and from {best.name} by {rmse[best.name]:.3g}"
     if clear and not far:
         said += "; but the target network was copied too seldom to tell (V5)"
@@ -79,11 +80,11 @@ def hypotheses(case: Case) -> Finding:
 
 
 def _told_apart(
-    case: Case, order: Sequence[_Hypothesis], rmse: Mapping[str, float]
+    case: Case, order: Sequence[_Hypothesis], rmse: Mapping[str, float], slack: float
 ) -> tuple[_Hypothesis, _Hypothesis | None]:
     """The best hypothesis, and another that cannot be told from it, by returns nor by the equation of one step."""
     best = order[0]
-    alike = [one for one in order[1:] if rmse[one.name] <= (1 + _ALIKE) * rmse[best.name] + 1e-9]
+    alike = [one for one in order[1:] if rmse[one.name] <= (1 + _ALIKE) * rmse[best.name] + slack]
     alike = [one for one in alike if one.family != best.family]
     rows = np.concatenate([_steps(one) for one in (*case.explored, *case.chance_valued)])
     for other in alike:
@@ -98,7 +99,9 @@ def _told_apart(
 
 
 def _residual(rows: Floats, alpha: float, beta: float) -> float:
-    return float(np.sqrt(((rows[:, 2] - alpha * rows[:, 0] - beta * rows[:, 1]) ** 2).mean()))
+    """The root mean square of what the equation leaves, no less than a thousandth of the values."""
+    left = np.sqrt(((rows[:, 2] - alpha * rows[:, 0] - beta * rows[:, 1]) ** 2).mean())
+    return max(float(left), 1e-3 * float(np.abs(rows[:, 2]).mean()))
 
 
 def _steps(one: Episode) -> Floats:

@@ -85,7 +85,7 @@ def bias(case: Case) -> Finding:
         "V2", "values are overestimated" if value > 0 else "values are underestimated", "algorithm", "B", value,
         (low, high), 0.1, "our own; the quantity is that of REDQ (Chen et al. 2021)", off, said,
         "double Q-learning, or a lower γ" if value > 0 else "see reach (V5) and the hypotheses (V3)",
-        f"neuralq train {case.world.name} --learner replay --target-rule double_q"
+        f"neuralq train {case.world.name} --learner replay --target-rule double"
         if value > 0 else f"neuralq train {case.world.name}  # λ-returns, which bootstrap less",
     )  # fmt: skip
 
@@ -263,7 +263,8 @@ def generalisation(case: Case) -> Finding:
     pick = case.rng(18).permutation(len(stored["reward"]))[:2000]
     learned = _td_error(case, *(stored[k][pick] for k in ("obs", "action", "reward", "next_obs", "terminated")))
     s, a, r, s_t, ended, _ = stacked(case.explored)
-    fresh_rows = case.rng(19).permutation(len(r))[:2000]
+    within = np.concatenate([np.arange(one.length) < one.within for one in case.explored])
+    fresh_rows = case.rng(19).permutation(np.flatnonzero(within))[:2000]
     fresh = _td_error(case, *(x[fresh_rows] for x in (s, a + case.world.first_action, r, s_t, ended)))
     ratio = fresh / max(learned, 1e-12)
     return Finding(
