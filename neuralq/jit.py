@@ -19,7 +19,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 
-__all__ = ["INTERPRETED", "kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel"]
+__all__ = ["INTERPRETED", "kernel", "lean_kernel", "lean_reassociating_kernel", "reassociating_kernel", "specialised"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -107,6 +107,27 @@ def lean_reassociating_kernel(function: Callable[P, R]) -> Callable[P, R]:
         6.0
     """
     return _compile(function, **_REASSOCIATES, _nrt=False)
+
+
+def specialised(function: Callable[P, R], *like: Any) -> Callable[P, R]:
+    """The machine code of a kernel for arguments of these types, which does not look at their types again.
+
+    Looking costs 7 µs where a kernel takes tuples of arrays, ten times what a short call does itself. Arguments of
+    other types than those of ``like`` must not be given: nothing would notice.
+
+    Example:
+        >>> import numpy as np
+        >>> @lean_kernel
+        ... def first(x: np.ndarray) -> float:
+        ...     return x[0]
+        >>> specialised(first, np.zeros(1))(np.arange(4.0))
+        0.0
+    """
+    compile_for: Any = getattr(function, "compile", None)
+    if compile_for is None:  # it is run as the Python that it is written in
+        return function
+    code: Callable[P, R] = compile_for(tuple(map(numba.typeof, like)))
+    return code
 
 
 def _compile(function: Callable[P, R], **special: bool | set[str]) -> Callable[P, R]:

@@ -4,41 +4,50 @@
     python scripts/mutants.py --room exact --seed 3 --minutes 10
     python scripts/mutants.py --file neuralq/rules/returns.py --minutes 5
 
-Mutants are made by cosmic-ray, in copies of the checkout; yours is not touched. First the tests have to pass on a copy
-that nobody has broken; then mutants are drawn at random from a seed that is printed, in turn from each room, until the
-time is up. Each meets the fast tests of its file: those that name the file or what it makes public, then those of the
-files that import it. A survivor that computes the same is struck, with the reason, in
-``scripts/equivalent_mutants.toml``. Exit status 1 when a room kills under 95 % of the others.
+Mutants are made by cosmic-ray, in copies of the checkout; yours is not touched. First the fast tests have to pass on a
+copy that nobody has broken, and each is asked which lines it runs; ``--seen FILE`` keeps that, so that the next time
+only tests run again that changed, or whose lines did. Then mutants are drawn at random from a seed that is printed, in
+turn from each room, until the time is up. Each meets the tests that run its line, quick files first, up to the first
+failure; a line that is only run by imports or compiled kernels meets the tests of its file and of those that import it.
+A test that also fails alone on sound code kills nothing. A survivor that computes the same is struck, with the reason,
+in ``scripts/equivalent_mutants.toml``. Exit status 1 when a room kills under 95 % of the others.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
+import json
 import os
 import re
-import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
+from hashlib import sha256
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from rich.progress import Progress
 
 if find_spec("cosmic_ray") is not None:  # `--help` answers without the extra
     from cosmic_ray.ast import ast_nodes, get_ast
-    from cosmic_ray.mutating import MutationVisitor, mutate_and_test
+    from cosmic_ray.mutating import MutationVisitor
     from cosmic_ray.plugins import get_operator
-    from cosmic_ray.work_item import MutationSpec, TestOutcome
+if TYPE_CHECKING:
+    from who_runs_what import Seen
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = {
@@ -50,9 +59,9 @@ ROOMS = {
 }
 EQUIVALENT = ROOT / "scripts" / "equivalent_mutants.toml"
 MARK = 0.95  # of the mutants that compute something else
-TESTS_OF_A_FILE = 8
+MOST_SECONDS = 120.0  # that the tests of one mutant may take
 SHOWN = ("frozen", "slots", "repr", "eq", "compare")  # how a record is shown and kept, not what it computes
-LIMIT = 240.0  # seconds for the tests of one mutant
+LIMIT = 240.0  # seconds, on a machine that others use, until they are stopped
 OPERATORS = [
     f"core/{operator}"
     for operator in (
@@ -153,44 +162,6 @@ def what_runs(source: str) -> str:
     return ast.dump(Stripped().visit(ast.parse(source)))
 
 
-@cache
-def public_names(file: str) -> tuple[str, ...]:
-    """What a file makes public: its ``__all__``, or its functions and classes."""
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
-            return tuple(ast.literal_eval(node.value))
-    return tuple(n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef))
-
-
-@cache
-def importers(module: str) -> tuple[str, ...]:
-    """The library's files that import a module."""
-    wanted = re.compile(rf"^\s*from {re.escape(module)} import|^\s*import {re.escape(module)}\b", re.MULTILINE)
-    files = (str(p.relative_to(ROOT)) for p in sorted((ROOT / "neuralq").rglob("*.py")))
-    return tuple(file for file in files if wanted.search((ROOT / file).read_text(encoding="utf-8")))
-
-
-@cache
-def tests_of(file: str) -> tuple[str, ...]:
-    """The doctests of a file and the tests that name it, then those of the files that import it, nearest first."""
-    room = ".".join(file.split("/")[:2])  # names such as `run` and `sweep` mean something else to tests of other rooms
-    texts = {p.name: p.read_text(encoding="utf-8") for p in sorted((ROOT / "tests").glob("test_*.py"))}
-    texts = {name: text for name, text in texts.items() if room in text}
-    chosen: list[str] = []
-    for near in (file, *importers(file.removesuffix(".py").replace("/", "."))):
-        module = re.escape(near.removesuffix(".py").replace("/", "."))
-        names = "|".join(map(re.escape, public_names(near))) or r"(?!)"
-        hits = {
-            name: 5 * len(re.findall(rf"\b{module}\b", text)) + len(re.findall(rf"\b(?:{names})\b", text))
-            for name, text in texts.items()
-        }
-        chosen += [name for name in sorted(hits, key=lambda name: -hits[name]) if hits[name] and name not in chosen]
-        if len(chosen) >= TESTS_OF_A_FILE:
-            break
-    return (file, *(f"tests/{test}" for test in chosen[:TESTS_OF_A_FILE]))
-
-
 def copied(parent: str) -> Path:
     """A copy of the checkout with its compiled kernels."""
     copy = Path(tempfile.mkdtemp(dir=parent))
@@ -207,47 +178,155 @@ def copied(parent: str) -> Path:
 
 
 def enter_copy(parent: str) -> None:
-    """Gives this process a copy of its own to break."""
+    """Gives this process a copy of its own to break, and what every test needs but the library."""
     copy = copied(parent)
     os.chdir(copy)
     os.environ["PYTHONPATH"] = os.pathsep.join((str(copy), str(copy / "envs")))
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.update(OMP_NUM_THREADS="1", PYTHONDONTWRITEBYTECODE="1")
+    sys.dont_write_bytecode = True  # a file that is broken and mended within a second would be taken for the old one
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != ROOT / "scripts"]
+    for name in ("torch", "scipy.optimize", "scipy.sparse.linalg", "numba", "gymnasium"):
+        import_module(name)
+    if "neuralq" in sys.modules:
+        raise RuntimeError("the library was loaded before it was broken")
 
 
-def pytest_command(tests: Iterable[str], *options: str) -> list[str]:
-    """Runs the fast ones among these tests."""
-    return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *options, *tests]
+def sources() -> list[Path]:
+    """The library's files, and the tests'."""
+    return sorted((*(ROOT / "neuralq").rglob("*.py"), *(ROOT / "tests").glob("test_*.py")))
 
 
-def control(parent: str, rooms: dict[str, list[Path]], workers: int) -> str:
-    """What the tests say of a copy that nobody has broken; nothing where they pass."""
-    paths = (path for room in rooms.values() for path in room)
-    tests = sorted({test for path in paths for test in tests_of(str(path.relative_to(ROOT)))})
-    copy = copied(parent)
-    paths_of_copy = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join((str(copy), str(copy / "envs"))),
-        "OMP_NUM_THREADS": "1",
-    }
-    command = pytest_command(tests, "-n", str(workers), "--dist", "loadfile")
-    result = subprocess.run(command, cwd=copy, env=paths_of_copy, capture_output=True, text=True, check=False)
-    return "" if result.returncode == 0 else result.stdout[-3000:] + result.stderr[-1000:]
+def is_tested(file: str) -> bool:
+    """Whether a file has tests that may run a line of a room."""
+    if not file.startswith("tests/"):
+        return file.startswith(tuple(ROOMS.values()))
+    names = "|".join(sorted({room.split("/")[1] for room in ROOMS.values()}))
+    return bool(re.search(rf"neuralq\.(?:{names})|from neuralq import", (ROOT / file).read_text(encoding="utf-8")))
 
 
-def outcome_of(mutant: Mutant) -> tuple[str, str]:
-    """Whether the tests of the file noticed, and what they printed; run in a copy."""
-    has_kernels = "neuralq.jit" in Path(mutant.file).read_text(encoding="utf-8")
+def to_run_again(seen: Seen, files: dict[str, str]) -> list[str]:
+    """The files with tests of which nothing is known, or that changed, as may have the lines that they run."""
+    by_file: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for test, ran in seen.items():
+        by_file[test.split("::")[0]].append(ran)
+
+    def stands(file: str) -> bool:
+        known = by_file.get(file, ())
+        return bool(known) and all(files.get(name) == text for ran in known for name, text in ran["files"].items())
+
+    return [file for file in files if is_tested(file) and not stands(file)]
+
+
+def control(parent: str, kept: Path | None, workers: int) -> tuple[Seen, str]:
+    """Which lines each test runs on a copy that nobody has broken, and what the tests say if they do not pass."""
+    copy, folder = copied(parent), tempfile.mkdtemp(dir=parent)
+    files = {str(p.relative_to(ROOT)): sha256(p.read_bytes()).hexdigest()[:12] for p in sources()}
+    seen: Seen = json.loads(kept.read_text(encoding="utf-8")) if kept and kept.is_file() else {}
+    again = to_run_again(seen, files)
+    stand = files.keys() - set(again)
+    seen = {test: ran for test, ran in seen.items() if test.split("::")[0] in stand}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(copy), str(copy / "envs"))), "OMP_NUM_THREADS": "1"}
+    options = ["-q", "-p", "no:cacheprovider", "-m", "not slow"]
+    side_by_side = ["-n", str(workers), "--dist", "loadfile"] if workers > 1 else []
+    command = [sys.executable, "scripts/who_runs_what.py", folder, *options, *side_by_side, *again]
+    if again:
+        result = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+        if result.returncode not in (0, 5):  # 5: there were none
+            return seen, result.stdout[-3000:] + result.stderr[-1000:]
+    for part in Path(folder).iterdir():
+        for test, ran in json.loads(part.read_text(encoding="utf-8")).items():
+            seen[test] = {**ran, "files": {name: files[name] for name in (test.split("::")[0], *ran["lines"])}}
+    if kept:
+        kept.write_text(json.dumps(seen), encoding="utf-8")
+    return seen, ""
+
+
+class Chosen:
+    """A plugin of pytest: leaves out all tests but these, and keeps what failed."""
+
+    def __init__(self, tests: Iterable[str]) -> None:
+        self._tests, self.failed = set(tests), ""
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = [item for item in items if item.nodeid in self._tests]
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.failed:
+            self.failed = report.nodeid
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.failed = report.nodeid
+
+
+def tried(tests: list[str], limit: float) -> tuple[str, str]:
+    """How a child of this process fares with the tests, and the first that failed."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        nothing = os.open(os.devnull, os.O_RDWR)
+        for descriptor in (0, 1, 2):
+            os.dup2(nothing, descriptor)
+        chosen = Chosen(tests)
+        status = 3
+        try:
+            files = list(dict.fromkeys(test.split("::")[0] for test in tests))
+            status = int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *files], [chosen]))
+        finally:
+            os.write(writer, chosen.failed.encode())
+            os._exit(status)
+    os.close(writer)
+    ended = end_of(child, limit)
+    os.set_blocking(reader, False)
+    with open(reader, "rb", buffering=0) as said:
+        failed = (said.read() or b"").decode()
+    if ended is None:
+        return "timed out", ""
+    if ended == 0:
+        return "survived", ""
+    return ("killed" if failed or ended < 0 else "broken"), failed or f"pytest ended with {ended}"
+
+
+def end_of(child: int, limit: float) -> int | None:
+    """The exit status of a child that leads its session, negative if a signal ended it; None where time was up."""
+    deadline, ended = time.monotonic() + limit, None
+    while ended is None and time.monotonic() < deadline:
+        found, status = os.waitpid(child, os.WNOHANG)
+        ended = os.waitstatus_to_exitcode(status) if found else None
+        time.sleep(0.02)
+    with contextlib.suppress(ProcessLookupError):  # with what its tests started and left
+        os.killpg(child, signal.SIGKILL)
+    if ended is None:
+        os.waitpid(child, 0)
+    return ended
+
+
+_SOUND: dict[str, str] = {}  # what became of a test alone, on sound code
+
+
+def outcome_of(mutant: Mutant, tests: list[str]) -> tuple[str, str]:
+    """Whether these tests noticed, and which; run in a copy."""
+    path = Path(mutant.file)
+    source = path.read_text(encoding="utf-8")
+    mutated = MutationVisitor.mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
     with tempfile.TemporaryDirectory() as kernels:
         # A kernel that calls a changed one in another file would come from the cache as it was before.
         os.environ.pop("NUMBA_CACHE_DIR", None)
-        if has_kernels:
+        if "from neuralq.jit" in source:
             os.environ["NUMBA_CACHE_DIR"] = kernels
-        change = MutationSpec(Path(mutant.file), mutant.operator, mutant.occurrence, (mutant.line, 0), (mutant.line, 1))
-        result = mutate_and_test([change], shlex.join(pytest_command(tests_of(mutant.file), "-x")), LIMIT)
-    output = result.output or ""
-    if output == "timeout":
-        return "timed out", output
-    return {TestOutcome.KILLED: "killed", TestOutcome.SURVIVED: "survived"}.get(result.test_outcome, "broken"), output
+        path.write_text(mutated, encoding="utf-8")
+        try:
+            outcome, failed = tried(tests, LIMIT)
+        finally:
+            path.write_text(source, encoding="utf-8")
+            os.environ.pop("NUMBA_CACHE_DIR", None)
+    if outcome == "killed" and "::" in failed:
+        if failed not in _SOUND:
+            _SOUND[failed] = tried([failed], LIMIT)[0]
+        if _SOUND[failed] != "survived":
+            return "broken", f"{failed} fails alone on sound code"
+    return outcome, failed
 
 
 def struck() -> dict[tuple[str, str, str], str]:
@@ -273,8 +352,12 @@ def drawn(rooms: dict[str, list[Path]], seed: int) -> Iterator[Mutant]:
                 yield mutant
 
 
-def run(parent: str, mutants: Iterator[Mutant], minutes: float, workers: int) -> list[tuple[Mutant, str, str]]:
+def run(
+    parent: str, seen: Seen, mutants: Iterator[Mutant], minutes: float, workers: int
+) -> list[tuple[Mutant, str, str]]:
     """What became of each mutant that began before the time was up."""
+    from who_runs_what import tests_of  # a script beside this one
+
     begun = time.monotonic()
     results: list[tuple[Mutant, str, str]] = []
     pending: dict[Future[tuple[str, str]], Mutant] = {}
@@ -285,14 +368,16 @@ def run(parent: str, mutants: Iterator[Mutant], minutes: float, workers: int) ->
                 mutant = next(mutants, None)
                 if mutant is None:
                     break
-                pending[pool.submit(outcome_of, mutant)] = mutant
+                pending[pool.submit(outcome_of, mutant, tests_of(mutant.file, mutant.line, seen, MOST_SECONDS))] = (
+                    mutant
+                )
             if not pending:
                 return results
             for future in wait(pending, timeout=5, return_when=FIRST_COMPLETED).done:
                 mutant = pending.pop(future)
                 results.append((mutant, *future.result()))
                 if results[-1][1] != "killed":
-                    progress.print(f"{results[-1][1]}: {mutant}", markup=False, highlight=False)
+                    progress.print(f"{results[-1][1]}: {mutant} {results[-1][2]}", markup=False, highlight=False)
             killed = sum(outcome == "killed" for _, outcome, _ in results)
             description = f"{killed} of {len(results)} killed"
             progress.update(bar, completed=time.monotonic() - begun, description=description)
@@ -306,6 +391,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="draws the mutants (default: a new one)")
     parser.add_argument("--minutes", type=float, default=25.0, help="no mutant begins later (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="mutants tried side by side (default: %(default)s)")
+    parser.add_argument("--seen", type=Path, metavar="FILE", help="keeps which lines each test runs, for the next time")
     arguments = parser.parse_args()
 
     if missing := [str(file) for file in arguments.file or () if not file.is_file()]:
@@ -319,18 +405,21 @@ def main() -> int:
         rooms = {room: sorted((ROOT / ROOMS[room]).rglob("*.py")) for room in arguments.room or ROOMS}
     print(f"seed {seed}", flush=True)
     with tempfile.TemporaryDirectory() as parent:
-        if said := control(parent, rooms, arguments.workers):
+        seen, said = control(parent, arguments.seen, arguments.workers)
+        if said:
             print(f"{said}\nThe tests fail on the code as it is; mend that first.")
             return 2
-        results = run(parent, drawn(rooms, seed), arguments.minutes, arguments.workers)
+        results = run(parent, seen, drawn(rooms, seed), arguments.minutes, arguments.workers)
 
     short = False
     for room in rooms:
-        outcomes = [outcome for mutant, outcome, _ in results if mutant.room == room]
+        outcomes = [outcome for mutant, outcome, _ in results if mutant.room == room and outcome != "broken"]
         # Tests that do not end notice as well as tests that fail: a loop whose exit is broken has no other sign.
         killed = sum(outcome in ("killed", "timed out") for outcome in outcomes)
         short |= killed < MARK * len(outcomes)
         print(f"{room}: {killed} of {len(outcomes)} killed, {outcomes.count('timed out')} of them by the clock")
+    if broken := [f"{mutant}: {said}" for mutant, outcome, said in results if outcome == "broken"]:
+        print(f"{len(broken)} could not be tried and count for nothing:", *broken, sep="\n")
     print(f"seed {seed}; {sum(known[0].startswith('neuralq') for known in struck())} mutants are struck as equivalent")
     return int(short)
 

@@ -204,6 +204,7 @@ def test_a_networks_step_is_the_semi_gradient(layout: type[torch.nn.Module]) -> 
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.slow
 def test_local_growth_is_the_derivative_of_the_whole_update(layout: type[torch.nn.Module]) -> None:
     q = layout((8,), 2, body=MLP(hidden=(2,), activation="tanh"), rng=1, dtype=torch.float64)
     backup = expected_backup(star(), torch.tensor(star().features))
@@ -223,6 +224,7 @@ def test_local_growth_of_linear_representations_is_the_global_one() -> None:
     assert table == pytest.approx(1 - 1e-4 / 7, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_script_prints_what_its_docstring_says(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -73,7 +73,7 @@ def test_no_preset_of_this_version_is_cut_by_its_own_budget() -> None:
 def test_python_and_the_command_line_agree_and_the_run_says_so(tmp_path: Path, capsys: Capture) -> None:
     short = with_preset({"env": "MountainCar-v0", "total_steps": 2_000})
     assert short.epsilon_decay_steps == 1_000
-    assert main(["train", "MountainCar-v0", "--total-steps", "2000", "--print_config"]) == 0
+    assert main(["train", "MountainCar-v0", "--total-steps", "2000", "--print-config"]) == 0
     assert yaml.safe_load(capsys.readouterr().out)["epsilon_decay_steps"] == 1_000
     file = tmp_path / "run.yaml"
     file.write_text("env: CartPole-v1\ntotal_steps: 64\nrollout: {num_envs: 2, num_steps: 16, num_minibatches: 2}\n")
@@ -83,7 +83,7 @@ def test_python_and_the_command_line_agree_and_the_run_says_so(tmp_path: Path, c
     assert (
         "within 64 steps ε falls over 32 steps, not 8,000 (--epsilon-decay-steps), the learning rate falls over" in said
     )
-    assert main(["train", *words, "--epsilon-decay-steps", "900", "--print_config"]) == 0
+    assert main(["train", *words, "--epsilon-decay-steps", "900", "--print-config"]) == 0
     assert yaml.safe_load(capsys.readouterr().out)["epsilon_decay_steps"] == 900
 
 

@@ -28,6 +28,7 @@ from neuralq.apps.chapter.ordering import episode_update, replaying, update_orde
 from neuralq.apps.chapter.prediction import lambda_recursion, random_walk_page
 from neuralq.apps.chapter.tic_tac_toe import exercise_13_3
 from neuralq.apps.cli import main
+from neuralq.apps.pages.grids import best_actions
 from neuralq.apps.pages.page import (
     Arrow,
     ChapterPage,
@@ -199,6 +200,15 @@ def test_a_grid_as_text() -> None:
         "│     ↓8    │███████████│",
         "└───────────┴───────────┘",
     ]
+
+
+def test_the_best_actions_of_a_drawing_do_not_depend_on_the_unit_of_rewards() -> None:
+    # A tie but for rounding, a second best by one part in a thousand, and a state that is worth nothing.
+    values = np.array([[1 / 3, 1 / 3 * (1 + 2e-16), np.nan, 1 / 3 * 0.999], [0.0, 0.0, 0.0, np.nan]])
+    for unit in (1e-200, 1e-12, 1.0, 1e12, 1e200):
+        assert best_actions(unit * values).tolist() == [[True, True, False, False], [True, True, True, False]]
+    assert best_actions([[-np.inf, np.nan]]).tolist() == [[False, False]]
+    assert best_actions([[1e12, 2.0], [1.0, 2.0]], tol=1e-11).tolist() == [[True, False], [True, True]]  # 10 apart
 
 
 def test_a_chart_as_text() -> None:

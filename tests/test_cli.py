@@ -1,7 +1,7 @@
 """The command line: what it prints, what it refuses and with which exit status.
 
 Mutants that must die here: the configuration file winning over the command line · a preset winning over either ·
---print_config without the environment · unknown keys passed over · settings of another learner ignored · status 0 for
+--print-config without the environment · unknown keys passed over · settings of another learner ignored · status 0 for
 a target that was not reached · anything after the JSON object on standard output · a seed that is not used.
 """
 
@@ -56,8 +56,8 @@ def refusal(capsys: Capture, argv: list[str], status: int) -> str:
 
 
 def configuration(capsys: Capture, argv: list[str]) -> dict[str, Any]:
-    """What --print_config prints."""
-    assert run(["train", *argv, "--print_config"]) == 0
+    """What --print-config prints."""
+    assert run(["train", *argv, "--print-config"]) == 0
     loaded: dict[str, Any] = yaml.safe_load(capsys.readouterr().out)
     return loaded
 
@@ -242,7 +242,7 @@ def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> N
         ("replay: {capacity: 500}", "settings for the replay learner would be ignored"),
         (
             "learner: sarsa",
-            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', got 'sarsa'",
+            "learner must be one of 'rollout', 'replay', 'online', 'streaming', 'gradient', 'tabular', got 'sarsa'",
         ),
         ("learner: [rollout]", "learner must be text, got ['rollout']"),
         ("total_steps: many", "total_steps must be a whole number, got 'many'"),
@@ -387,7 +387,7 @@ def test_counts_out_of_range_are_refused(trained: Path, capsys: Capture) -> None
     assert "seed" in refusal(capsys, ["evaluate", str(trained), "--seed", "-1"], 1)
     assert "total_steps" in refusal(capsys, ["resume", str(trained), "--total-steps", "0"], 1)
     assert run(["solve", "FrozenLake-v1", "--env-kwargs", "{x"]) == 2
-    assert "is no JSON" in capsys.readouterr().err
+    assert "--env-kwargs: must be a mapping, got {x" in capsys.readouterr().err
 
 
 def test_tensorboard_files_are_written_and_continued(tmp_path: Path, capsys: Capture) -> None:

@@ -8,6 +8,7 @@ repeated seed counted twice · a curve before every run has begun · runs withou
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 
 from neuralq.apps.cli import main
 from neuralq.runs.folder.run_folder import RunFolder, RunFolderError
+from neuralq.runs.recipe.presets import PRESETS, REACHED
 from neuralq.runs.report.comparison import group_curve, read_groups
 from neuralq.runs.sweep import create_sweep
 
@@ -166,27 +168,51 @@ def test_wrong_usage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Ca
     assert 'pip install "neuralq[plot]"' in capsys.readouterr().err
 
 
-def test_presets_are_listed_with_their_settings(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_presets_are_an_overview_of_one_line_each_and_one_is_shown_whole(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
     rollout = {
         "gamma": 0.9,
         "body": {"class": "MLP", "hidden": [64, 32], "layer_norm": True},
         "rollout": {"lambda_": 0},
     }
-    known = {("CartPole-v1", "rollout"): rollout, ("Acrobot-v1", "online"): {"gamma": 1.0}}
+    known = {
+        ("CartPole-v1", "rollout"): rollout, ("Acrobot-v1", "online"): {"gamma": 1.0, "total_steps": 5000},
+        ("CartPole-v1", "online"): {},
+    }  # fmt: skip
     monkeypatch.setattr("neuralq.apps.cli.presets.PRESETS", known)
+    monkeypatch.setattr("neuralq.apps.cli.presets.REACHED", {("CartPole-v1", "rollout"): "500.0 (486.1 to 500.0)"})
     assert main(["presets"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(maxsplit=3) for line in lines[1:4]] == [
+        ["CartPole-v1", "rollout", "100,000", "500.0 (486.1 to 500.0)"],
+        ["CartPole-v1", "online", "100,000", "-"],
+        ["Acrobot-v1", "online", "5,000", "-"],
+    ]
+    assert lines[4] == "agents for any environment, by --preset NAME: rainbow (replay learner)"
+    assert main(["presets", "CartPole-v1"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "CartPole-v1, rollout learner: neuralq train CartPole-v1",
+        "    reaches 500.0 (486.1 to 500.0)",
         "    gamma = 0.9",
         "    body.class = MLP",
         "    body.hidden = 64,32",
         "    body.layer_norm = true",
         "    rollout.lambda = 0",
-        "Acrobot-v1, online learner: neuralq train Acrobot-v1 --learner online",
-        "    gamma = 1.0",
+        "CartPole-v1, online learner: neuralq train CartPole-v1 --learner online",
     ]
     assert main(["presets", "Acrobot-v1", "--json"]) == 0
     (preset,) = json.loads(capsys.readouterr().out)["presets"]
-    assert preset == {"env": "Acrobot-v1", "learner": "online", "settings": {"gamma": 1.0}}
+    assert preset["settings"] == {"gamma": 1.0, "total_steps": 5000} and preset["reached"] is None
     assert main(["presets", "CartPol-v1"]) == 1
     assert "no preset for 'CartPol-v1'; did you mean CartPole-v1?" in capsys.readouterr().err
+    assert main(["presets", "rainbow"]) == 0
+    assert "    replay.noisy = true" in capsys.readouterr().out.splitlines()
+
+
+def test_what_a_preset_reaches_stands_in_the_benchmarks() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    for key, reached in REACHED.items():
+        assert key in PRESETS
+        for figure in re.findall(r"[−\d.]*\d", reached):
+            assert figure in text, (key, figure)

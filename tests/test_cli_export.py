@@ -100,6 +100,7 @@ def test_the_file_gives_the_runs_values(
         assert np.array_equal(np.isfinite(values[0]), np.asarray(mask) != 0)
 
 
+@pytest.mark.slow
 def test_dueling_streams_of_a_distribution(tmp_path: Path, capsys: Capture) -> None:
     """They are reshaped twice, and neither may remember the batch that was traced."""
     words = ["--preset", "false", "--total-steps", "40", "--learner", "replay", "--replay.learning-starts", "20"]
@@ -141,6 +142,7 @@ def test_greedy_actions_are_compared_too(tmp_path: Path, monkeypatch: pytest.Mon
     assert "differs from the run's by inf" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_statistics_of_observations_are_part_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

@@ -141,7 +141,7 @@ def test_matrix_lists_judges_and_writes(capsys: Capture, tmp_path: Path, monkeyp
 
 def test_the_whole_grid_fits_narrow_and_wide_terminals(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lab_matrix, "_DETAILED", 0)
-    some = ["--problem", "baird", "--problem", "w2w", "--method", "td", "--method", "sarsa", "--jobs", "1"]
+    some = ["--problem", "baird", "--problem", "w2w", "--method", "td", "--method", "sarsa", "--workers", "1"]
     for width in ("40", "80", "120"):
         monkeypatch.setenv("COLUMNS", width)
         text = printed(capsys, "matrix", *some)
@@ -152,7 +152,7 @@ def test_the_whole_grid_fits_narrow_and_wide_terminals(capsys: Capture, monkeypa
 @pytest.mark.slow
 def test_processes_change_nothing(capsys: Capture) -> None:
     some = ["matrix", "--problem", "w2w", "--problem", "kolter", "--method", "td", "--method", "fitted"]
-    assert answer(capsys, *some, "--jobs", "2") == answer(capsys, *some, "--jobs", "1")
+    assert answer(capsys, *some, "--workers", "2") == answer(capsys, *some, "--workers", "1")
 
 
 def test_a_disagreement_ends_with_status_1_and_is_listed(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,7 +76,7 @@ def test_the_16_grid_diverges_as_published_and_a_tilt_saves_it(capsys: Capture) 
     assert found["stopped_on_cap"] and found["num_points"] == 256
     assert found["hat_norm"] == pytest.approx(3.0336, rel=1e-4)  # independent float64 computation
     assert found["ray_growth"] == pytest.approx(1.0850436, rel=1e-6)
-    after_500 = answer(capsys, "gridworld", "--iterations", "500")["max_abs"]
+    after_500 = answer(capsys, "gridworld", "--max-iterations", "500")["max_abs"]
     assert after_500[-1] == [500, pytest.approx(1.9097e8, rel=1e-4)]
     assert after_500[6] == [300, pytest.approx(15.0143, rel=1e-4)]
     tilted = answer(capsys, "gridworld", "--start", "tilted")
@@ -86,9 +86,9 @@ def test_the_16_grid_diverges_as_published_and_a_tilt_saves_it(capsys: Capture) 
 
 def test_a_run_too_short_to_tell_is_called_undecided(capsys: Capture) -> None:
     """The same tilted run that settles after 769 sweeps, on its way up from a trough."""
-    found = answer(capsys, "gridworld", "--start", "tilted", "--iterations", "500")
+    found = answer(capsys, "gridworld", "--start", "tilted", "--max-iterations", "500")
     assert found["verdict"] == "undecided" and "Undecided" in found["explanation"]
-    assert "more --iterations" in printed(capsys, "gridworld", "--start", "tilted", "--iterations", "500")
+    assert "more --max-iterations" in printed(capsys, "gridworld", "--start", "tilted", "--max-iterations", "500")
 
 
 def test_the_parts_stand_in_the_order_verdict_run_words(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,10 +99,11 @@ def test_the_parts_stand_in_the_order_verdict_run_words(capsys: Capture, monkeyp
         assert order == sorted(order) and "…" not in text
         assert max(map(len, text.splitlines())) <= int(width)
         sure = printed(capsys, "gridworld", "--regressor", "nearest")
-        assert "yes, from any start" in sure and "Converges for certain" in sure and "more --iterations" not in sure
+        assert "yes, from any start" in sure and "Converges for certain" in sure and "more --max-iterations" not in sure
     assert "tilted start" in printed(capsys, "car-on-the-hill", "--start", "tilted", "--regressor", "nearest")
 
 
+@pytest.mark.slow
 def test_everything_is_passed_on(capsys: Capture) -> None:
     near = answer(capsys, "puddle-world", "--regressor", "nearest", "--neighbours", "3", "--gamma", "0.9")
     expected = diagnose_fitted(puddle_world(), grid_support(puddle_world(), 16), NearestNeighbours(3), gamma=0.9)
@@ -134,6 +135,7 @@ def test_errors_are_against_exact_costs_where_those_are_known(capsys: Capture) -
     assert exact["error"][0] == [0, 0.0]  # the nearest point of a point is itself
 
 
+@pytest.mark.slow
 def test_growing_the_support_finds_the_shortest_paths(capsys: Capture) -> None:
     grown = answer(capsys, "gridworld", "--grow-support")["grown"]
     assert grown["complete"] and grown["num_points"] == grown["num_reached"] == 256
@@ -144,12 +146,13 @@ def test_growing_the_support_finds_the_shortest_paths(capsys: Capture) -> None:
     assert strict["history"] != lax["history"]
 
 
+@pytest.mark.slow
 def test_the_table_has_every_world_under_every_regressor(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    text = printed(capsys, "--points", "8", "--iterations", "200")
+    text = printed(capsys, "--points", "8", "--max-iterations", "200")
     assert "…" not in text and max(map(len, text.splitlines())) <= 80
     assert all(text.count(f" {one.name} ") == 3 * (one.name != "network") for one in REGRESSORS)
-    cases = answer(capsys, "--points", "6", "--iterations", "100")["cases"]
+    cases = answer(capsys, "--points", "6", "--max-iterations", "100")["cases"]
     assert [case["world"] for case in cases[::7]] == [make().name for make in WORLDS]
     assert {case["regressor"] for case in cases if case["certain"]} >= {"interpolation"}
     some = answer(capsys, "gridworld", "--regressor", "nearest", "--regressor", "linear", "--points", "6")["cases"]
@@ -158,7 +161,9 @@ def test_the_table_has_every_world_under_every_regressor(capsys: Capture, monkey
 
 @pytest.mark.slow  # it loads PyTorch
 def test_a_network_is_run_if_asked(capsys: Capture) -> None:
-    found = answer(capsys, "gridworld", "--regressor", "network", "--points", "4", "--hidden", "3", "--iterations", "3")
+    found = answer(
+        capsys, "gridworld", "--regressor", "network", "--points", "4", "--hidden", "3", "--max-iterations", "3"
+    )
     assert (found["averager"], found["hat_norm"], found["sweeps"]) == (None, None, 3)
 
 
@@ -181,7 +186,7 @@ def test_list_names_worlds_and_regressors(capsys: Capture) -> None:
         (["gridworld", "--points", "50", "--regressor", "lwr"], 1, "at most 40 for lwr"),
         (["gridworld", "--gamma", "2"], 1, "--gamma must lie in [0, 1]"),
         (["gridworld", "--gamma", "nan"], 1, "--gamma must lie in [0, 1]"),
-        (["gridworld", "--iterations", "0"], 1, "--iterations must be a whole number"),
+        (["gridworld", "--max-iterations", "0"], 1, "--max-iterations must be a whole number"),
         (["gridworld", "--seed", "-1", "--support", "random"], 1, "--seed must be a whole number"),
         (["gridworld", "--regressor", "interpolation", "--support", "random"], 1, "needs a full grid"),
         (["gridworld", "--regressor", "nearest", "--neighbours", "0"], 1, "num_neighbours"),

@@ -178,13 +178,13 @@ def test_from_the_command_line_in_the_folder_where_it_lies(tmp_path: Path, monke
     (tmp_path / "other_nets.py").write_text(SOURCE)
     (tmp_path / "other_game.py").write_text(
         "import gymnasium as gym\nfrom gymnasium.envs.classic_control import CartPoleEnv\n"
-        "gym.register('Other-v0', CartPoleEnv, max_episode_steps=20)\n"
+        "gym.register('OtherGame-v0', CartPoleEnv, max_episode_steps=20)\n"
     )
     monkeypatch.chdir(tmp_path)
     before = list(sys.path)
     words = ["--rollout.num-envs", "2", "--rollout.num-steps", "16", "--total-steps", "32"]
     words += ["--evaluation-episodes", "1", "--run-dir", "run"]
-    assert main(["train", "other_game:Other-v0", *words, "--body", "other_nets:Tower", "--hidden", "8"]) == 0
+    assert main(["train", "other_game:OtherGame-v0", *words, "--body", "other_nets:Tower", "--hidden", "8"]) == 0
     assert sys.path == before
     stored = json.loads((tmp_path / "run" / "config.json").read_text())
     assert stored["body"] == {

@@ -79,6 +79,15 @@ def rollout_of(stream: Interaction, experience: RolloutExperience) -> Sample:
             return sample
 
 
+@pytest.mark.parametrize("moved", [[0, 1, 2], [0, 2]])
+def test_a_step_without_all_its_fields_does_not_leave_those_of_an_earlier_one(moved: list[int]) -> None:
+    stream = stream_of(AutoresetMode.NEXT_STEP)
+    rows = tuple(row[moved] for row in stream.step(act).rows)
+    experience = RolloutExperience(T, N, stream.spec)
+    with pytest.raises(ValueError, match="zip"):
+        experience.add(Step(rows[:-1], np.array(moved), ()))
+
+
 @pytest.mark.parametrize("returns", ["peng", "watkins"])
 def test_returns_of_real_rows_are_those_of_a_stream_without_pauses(returns: str) -> None:
     learner = learner_of(returns)

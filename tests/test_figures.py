@@ -292,6 +292,7 @@ def run_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     return capsys.readouterr().out.splitlines()
 
 
+@pytest.mark.slow
 def test_script_lists_and_draws(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -191,7 +191,7 @@ def test_the_seeds_of_a_sweep_move_with_it(copy: Path, tmp_path: Path) -> None:
     edited(sweep.run_path(0), device="cuda:77", stop_at_return=3.0)
     sweep.config["device"], sweep.config["stop_at_return"] = "cpu", None
     words = sweeps._command(sweep, 0)
-    assert words[words.index("--total-steps") + 2 :] == ["--stop-at-return=none", "--device=cpu"]
+    assert words[words.index("--total-steps") + 2 :] == ["--set=device=cpu", "--set=stop_at_return=none"]
 
 
 # Budgets and targets

@@ -229,6 +229,7 @@ def test_the_units_of_the_features_do_not_matter(seed: int, exponent: float, nam
 
 @settings(max_examples=10, deadline=None)
 @given(SEEDS, st.permutations(range(4)), st.sampled_from(["expected", "iid", "markov"]))
+@pytest.mark.slow
 def test_the_names_of_the_states_do_not_matter(seed: int, order: list[int], sampling: str) -> None:
     problem, s = random_problem(seed), np.array(order)
     model = problem.mdp
@@ -246,6 +247,7 @@ def test_the_names_of_the_states_do_not_matter(seed: int, order: list[int], samp
 
 @settings(max_examples=10, deadline=None)
 @given(SEEDS, st.sampled_from(["td", "tdc", "etd", "residual"]), st.sampled_from(["expected", "markov"]))
+@pytest.mark.slow
 def test_a_state_that_is_never_entered_does_not_matter(seed: int, name: str, sampling: str) -> None:
     problem = random_problem(seed)
     model = problem.mdp
@@ -311,6 +313,7 @@ def test_the_verdict_turns_at_the_bound_and_the_fixed_point_is_reached(seed: int
 
 
 @pytest.mark.parametrize("problem", [star(), kolter()], ids=["star", "kolter"])
+@pytest.mark.slow
 def test_every_remedy_converges_when_it_is_run(problem: Problem) -> None:
     remedies = prescribe(problem)
     assert len(remedies) > 5

@@ -96,6 +96,7 @@ def test_published_verdicts_of_the_star() -> None:
     assert found.cell("baird", "td").growth == pytest.approx(sweep.growth, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_chattering_is_seen_without_the_diagnosis() -> None:
     """Gordon 1996: Sarsa keeps switching between two greedy policies, Q-learning on the same problem settles."""
     found = matrix(["chattering"], ["sarsa", "q-learning"])

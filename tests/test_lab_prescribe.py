@@ -22,6 +22,7 @@ def remedies(request: pytest.FixtureRequest) -> list[Remedy]:
     return prescribe(problem(request.param))
 
 
+@pytest.mark.slow
 def test_each_remedy_trains(remedies: list[Remedy]) -> None:
     assert len(remedies) >= 9
     for one in remedies:

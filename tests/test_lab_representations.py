@@ -94,6 +94,7 @@ def test_the_table_learns_q_star_in_control_and_the_error_is_that_of_pairs() -> 
     assert linear.rmsve[0] == pytest.approx(start, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_networks_learn_the_chain_and_see_what_was_asked_for() -> None:
     results = run_representations(problem_of("walk5"), 800, 0.8, body=MLP(hidden=(12,), activation="tanh"))
     assert [found.representation for found in results] == list(REPRESENTATIONS)

@@ -145,6 +145,7 @@ SWEEPS = [
 
 
 @pytest.mark.parametrize(("method", "alpha", "alpha_h", "beta", "known"), SWEEPS, ids=["TDC", "GTD2", "TDRC"])
+@pytest.mark.slow
 def test_expected_updates_on_the_star(
     method: str, alpha: float, alpha_h: float, beta: float, known: dict[int, float]
 ) -> None:
@@ -192,6 +193,7 @@ def test_td_diverges_on_the_sampled_star_and_its_corrections_do_not() -> None:
         assert run_on_star("TDRC", seed, 500) < 12
 
 
+@pytest.mark.slow
 def test_negative_control_the_other_sign_of_the_correction_diverges() -> None:
     for seed in range(3):
         assert run_on_star("flipped", seed, 400) > 1e3

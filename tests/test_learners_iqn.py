@@ -208,6 +208,7 @@ def bandit(q: Any, dtype: torch.dtype, s_of: Any, **given: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.slow
 def test_the_quantiles_of_known_distributions_are_learned(kind: str) -> None:
     if kind == "table":
         q = bandit(ImplicitQuantileQ(TableQ(1, 32), num_cosines=16), F64, lambda n: torch.zeros(n, dtype=torch.int64),

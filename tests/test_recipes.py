@@ -180,3 +180,32 @@ def test_the_lander_trains_with_its_preset(tmp_path: Path) -> None:
 def test_a_device_that_is_not_there_is_refused_before_anything_is_built() -> None:
     with pytest.raises(ValueError, match="cannot compute on device 'cuda:63'"):
         build_session(RunConfig(device="cuda:63"))
+
+
+def test_an_environment_without_a_preset_gets_the_replay_learners_general_one() -> None:
+    general = with_preset({"env": "Unknown-v0", "learner": "replay"})
+    assert general.replay is not None and general.replay.num_steps > 1
+    assert general.replay == with_preset("Other-v3", learner="replay").replay
+    for other in ({"layout": "linear"}, {"env": "ALE/Pong-v5"}):  # other rates than a small network's
+        plain = {"env": "Unknown-v0", "learner": "replay", **other}
+        assert with_preset(plain) == config_from_dict(plain)
+    for given in ({"target_rate": 0.5}, {"target_period_updates": 7}, {"target_rule": "retrace", "block_length": 4}):
+        chosen = with_preset({"env": "Unknown-v0", "learner": "replay", "replay": given}).replay
+        assert {name: getattr(chosen, name) for name in given} == given
+
+
+def test_rainbow_is_all_six_parts_on_any_environment() -> None:
+    config = with_preset("CartPole-v1", preset="rainbow")
+    settings = config.replay
+    assert settings is not None and config.dueling and settings.noisy and settings.prioritised
+    assert (settings.target_rule, settings.num_steps, settings.distribution) == ("double", 3, "categorical")
+    assert config.epsilon_start == config.epsilon_end == 0.0
+    with pytest.raises(ValueError, match="name the smallest and the largest return"):
+        with_preset("Unknown-v0", preset="rainbow")
+    assert with_preset("Unknown-v0", preset="rainbow", value_min=0.0, value_max=5.0).replay.value_max == 5.0  # type: ignore[union-attr]
+    atari = with_preset("ALE/Pong-v5", preset="rainbow")
+    assert atari.clip_rewards and atari.replay is not None and atari.replay.value_max == 10.0
+    with pytest.raises(ValueError, match="rainbow is for the replay learner, got rollout"):
+        with_preset("CartPole-v1", preset="rainbow", learner="rollout")
+    with pytest.raises(ValueError, match="preset must be one of 'rainbow', got 'rainbows'"):
+        with_preset("CartPole-v1", preset="rainbows")

@@ -159,7 +159,7 @@ def test_a_learner_in_a_file_of_its_own_is_offered_trains_and_resumes(tmp_path: 
         [*train, "--total-steps", "120", *whole],
     ]
     offered, *runs = json.loads(said_by(tmp_path, "learners", COMMANDS, json.dumps(commands)))
-    assert "{rollout,replay,online,streaming,gradient,nearsighted}" in offered
+    assert "{rollout,replay,online,streaming,gradient,tabular,nearsighted}" in offered
     assert "sees no further than the reward: this test" in offered
     assert "--nearsighted.step-size X" in offered and "how far a value moves towards the reward" in offered
     assert json.loads((tmp_path / "parts" / "config.json").read_text())["nearsighted"] == {"step_size": 0.25}
@@ -227,6 +227,7 @@ for given in ({"halfway_share": 0.5}, {"target_rule": "halfway", "halfway_share"
 """
 
 
+@pytest.mark.slow
 def test_a_target_rule_in_a_file_of_its_own_is_learned_with_every_distribution(tmp_path: Path) -> None:
     (tmp_path / "halfway.py").write_text(HALFWAY)
     assert said_by(tmp_path, "rules", TRIED).splitlines() == [

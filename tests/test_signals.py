@@ -137,6 +137,7 @@ def test_a_second_signal_waits_while_a_checkpoint_is_being_written(
     assert checkpoint.load_newest(tmp_path / "run" / "checkpoints").step == 160
 
 
+@pytest.mark.slow
 def test_a_match_that_measures_td_gammon_is_abandoned_and_made_up_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

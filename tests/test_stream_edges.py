@@ -6,6 +6,7 @@ at all.
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from neuralq.runs.stream import EnvironmentFault, Interaction, interact
+from neuralq.runs.stream.vector_env import make_vector_env
 
 
 class Masking(gym.Env[Any, Any]):
@@ -107,3 +109,88 @@ def test_masks_of_a_vector_environment_need_not_say_whose_they_are(monkeypatch: 
 
     monkeypatch.setattr(envs, "reset", plain)
     assert Interaction(envs, 0.9, 0).state_dict()["s"][:, 1:].tolist() == [[0, 1, 0], [0, 1, 0]]
+
+
+def masks_given(monkeypatch: pytest.MonkeyPatch, masks: list[Any], held: list[bool]) -> Interaction:
+    """A stream whose first reset tells three masks, as an array of objects, of which some are there."""
+    envs = SyncVectorEnv([lambda: Masking(True)] * 3, autoreset_mode=AutoresetMode.DISABLED)
+    reset, given = envs.reset, np.empty(3, dtype=object)
+    given[:] = masks
+
+    def of_objects(**kwargs: Any) -> Any:
+        observation, _ = reset(**kwargs)
+        return observation, {"action_mask": given, "_action_mask": np.array(held)}
+
+    monkeypatch.setattr(envs, "reset", of_objects)
+    return Interaction(envs, 0.9, 0)
+
+
+def test_masks_may_come_as_objects_and_each_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = [[0, 1, 0], None, np.array([True, False, True])]
+    stream = masks_given(monkeypatch, given, [True, False, True])
+    assert stream.state_dict()["s"][:, 1:].tolist() == [[0, 1, 0], [1, 1, 1], [1, 0, 1]]
+    with pytest.raises(EnvironmentFault, match=r"environment 2, step 1 .* must have 3 entries, got shape \(2,\)"):
+        masks_given(monkeypatch, [[0, 1, 0], [0, 0, 1], [1, 1]], [True, True, True])
+    with pytest.raises(EnvironmentFault, match=r"environment 2, step 1 .* got shape \(4,\)"):
+        masks_given(monkeypatch, [[0, 1, 0], None, [1, 1, 1, 1]], [True, False, True])
+
+
+@pytest.mark.parametrize(
+    ("stops_at", "error", "note"),
+    [(0, OSError, None), (1, OSError, "1 of 3 were made before"), (2, OSError, "2 of 3 were made before"),
+     (2, KeyboardInterrupt, None), (3, OSError, None)],
+)  # fmt: skip
+def test_how_many_environments_were_made_is_told_where_that_may_be_the_reason(
+    stops_at: int, error: type[BaseException], note: str | None
+) -> None:
+    closed: list[int] = []
+
+    class Counted(Masking):
+        def close(self) -> None:
+            closed.append(made)
+
+    made = 0
+
+    def make() -> gym.Env[Any, Any]:
+        nonlocal made
+        if made == stops_at:
+            raise error("no more")
+        made += 1
+        env = Counted(False)
+        if stops_at == made == 3:  # all are made, and do not go together
+            env.observation_space = spaces.Box(0, 1, (2,), np.float32)
+        return env
+
+    with pytest.raises(BaseException) as raised:
+        make_vector_env(make, 3)
+    assert isinstance(raised.value, error) == (stops_at < 3) and len(closed) == made
+    notes = getattr(raised.value, "__notes__", [])
+    assert [] == notes if note is None else note in notes[0]
+
+
+@pytest.mark.parametrize("reward", ["1.0", b"1.0", np.str_("1"), np.array("1.0"), np.array(b"1")], ids=repr)
+def test_the_text_of_a_number_is_no_reward(monkeypatch: pytest.MonkeyPatch, reward: Any) -> None:
+    stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+    monkeypatch.setattr(Failing, "step", lambda self, action: (np.zeros(1), reward, False, False, {}))
+    with pytest.raises(EnvironmentFault, match=r"environment 0: reward must be a number, got .*1"):
+        stream.step(lambda s: push(s, np.random.default_rng(0)))
+    for batch in ([reward, 1.0], np.array(["1.0", "2.0"]), np.array([1.0, reward], dtype=object)):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        found = (np.zeros((2, 1)), batch, np.zeros(2, bool), np.zeros(2, bool), {})
+        with monkeypatch.context() as patched, pytest.raises(EnvironmentFault, match="field reward: must be numbers"):
+            patched.setattr(stream.envs, "step", lambda actions, found=found: found)
+            stream.step(lambda s: push(s, np.random.default_rng(0)))
+
+
+def test_numbers_of_every_kind_are_rewards(monkeypatch: pytest.MonkeyPatch) -> None:
+    for reward in (1, True, np.float32(1), np.int8(1), np.array(1.0), torch.tensor(1.0), Fraction(1)):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        with monkeypatch.context() as patched:
+            patched.setattr(Failing, "step", lambda self, action, r=reward: (np.zeros(1), r, False, False, {}))
+            assert stream.step(lambda s: push(s, np.random.default_rng(0))).rows[3].tolist() == [1.0, 1.0]
+    for batch in ([1, 2.0], (np.float32(1), Fraction(2)), np.array([1, 2], np.int8)):
+        stream = Interaction(envs_of(AutoresetMode.DISABLED), 0.9, 0)
+        found = (np.zeros((2, 1)), batch, np.zeros(2, bool), np.zeros(2, bool), {})
+        with monkeypatch.context() as patched:
+            patched.setattr(stream.envs, "step", lambda actions, found=found: found)
+            assert stream.step(lambda s: push(s, np.random.default_rng(0))).rows[3].tolist() == [1.0, 2.0]

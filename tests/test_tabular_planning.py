@@ -177,6 +177,7 @@ def total_steps(policy: np.ndarray, seen: np.ndarray, mdp: FiniteMDP) -> float:
     return total
 
 
+@pytest.mark.slow
 def test_sarsa_lambda_finds_a_good_memoryless_policy_and_one_step_q_learning_does_not() -> None:
     maze_ = dyna_maze()
     cells = np.array([(s // 9, s % 9) not in WALLS and s != 8 for s in range(54)])

@@ -91,6 +91,7 @@ def test_the_star_turns_under_the_keyboard(page: Any, address: str) -> None:
     expect(page, "#critical", "0.88235294")  # 15/17
 
 
+@pytest.mark.slow
 def test_the_star_is_drawn_so_that_one_sees_it(page: Any, address: str) -> None:
     """ρ = 1.0024 is on the circle unless one looks closely, and six of Baird's weights are one line."""
     page.goto(address)

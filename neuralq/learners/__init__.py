@@ -10,6 +10,8 @@ Prediction is control with one action. True online TD(λ) is `PredictionLearner`
 linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
 a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
 
+`TabularLearner` runs the compiled loops of `neuralq.tabular`: every algorithm of the chapter on a table.
+
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 
@@ -29,6 +31,8 @@ from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
+from neuralq.learners.tabular.learner import TabularLearner
+from neuralq.learners.tabular.settings import TabularSettings
 from neuralq.learners.traces.learner import OnlineLearner, OnlineSettings, PredictionLearner
 from neuralq.learners.traces.streaming import StreamingLearner, StreamingSettings
 
@@ -58,6 +62,8 @@ __all__ = [
     "RolloutSettings",
     "StreamingLearner",
     "StreamingSettings",
+    "TabularLearner",
+    "TabularSettings",
     "TangentCorrection",
     "Traits",
     "TwinHead",

@@ -79,8 +79,13 @@ class Descent:
             target.copy_(state["target"])
 
 
-def count_update(self: Any, target_period: int | None) -> None:
-    """One more update; at every ``target_period``-th the parameters are copied into the target network, if any."""
+def count_update(self: Any, target_period: int | None, target_rate: float | None = None) -> None:
+    """One more update; at every ``target_period``-th the parameters are copied into the target network, if any.
+
+    With a ``target_rate`` τ it moves at every update instead, by τ of the way (Lillicrap et al. 2016).
+    """
     self.num_updates += 1
-    if target_period is not None and self.num_updates % target_period == 0:
+    if target_rate is not None:
+        self.engine.sync_target(target_rate)
+    elif target_period is not None and self.num_updates % target_period == 0:
         self.engine.sync_target()

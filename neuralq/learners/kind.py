@@ -54,6 +54,8 @@ class Parts:
         total_steps: the run's budget in environment steps.
         kernels: the engine that was asked for, "auto", "torch" or "compiled".
         another: makes another representation like the engine's, with weights drawn for itself.
+        exploration: ε at the first step, in the end, and the environment steps in between, for learners that act by
+            themselves.
     """
 
     engine: Engine
@@ -64,6 +66,7 @@ class Parts:
     total_steps: int
     kernels: str
     another: Callable[[], QFunction]
+    exploration: tuple[float, float, int] = (1.0, 0.05, 20_000)
 
 
 @dataclass(frozen=True)
@@ -107,15 +110,17 @@ class LearnerKind:
         build: ``build(parts) -> learner``.
         experience: in which pieces it takes experience: "rollouts" ``[T, N]`` (the settings have num_envs and
             num_steps), "replay" (batch_size, block_length, capacity, learning_starts, num_envs, num_steps, prioritised,
-            train_period and updates_per_period, as `ReplaySettings` has), or "steps" ``[N]`` as they come (num_envs,
-            or 1).
+            train_period and updates_per_period, as `ReplaySettings` has), "steps" ``[N]`` as they come (num_envs,
+            or 1), or "table", where it acts by itself in one environment or its model (simulate).
         traits: what it is like where divergence is looked for.
         loss: of the engine.
         normalises: whether observations are normalised (None: unless they are state indices), and whether rewards are.
         outputs: ``outputs(settings, layout)``: how many numbers the representation has for every action.
         represent: the Q-function that those outputs describe: ``represent(q, settings, reward_scale, rng)``.
         check: ``check(settings, representation)`` raises a `ValueError` with the way out where they do not go together.
+        layout: of the representation where none is chosen.
         place: where it stands in lists; those of one number by name.
+        step_sizes: settings that a run may go on with otherwise than it began.
     """
 
     name: str
@@ -130,11 +135,14 @@ class LearnerKind:
     outputs: Callable[[Any, str], int] = lambda settings, layout: 1
     represent: Callable[[QFunction, Any, float, np.random.Generator], QFunction] = _as_it_is
     check: Callable[[Any, Representation], None] = _anything
+    layout: str = "action-output"
     place: int = 100
+    step_sizes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse experience that no run hands out."""
-        check_choice(f"experience of the learner {self.name!r}", self.experience, ("rollouts", "replay", "steps"))
+        kinds = ("rollouts", "replay", "steps", "table")
+        check_choice(f"experience of the learner {self.name!r}", self.experience, kinds)
 
 
 @functools.cache

@@ -234,4 +234,5 @@ ROLLOUT = LearnerKind(
     traits=lambda s: Traits(s.learning_rate, s.optimiser == "sgd", s.lambda_, s.target_period_updates),
     normalises=lambda s: (s.normalise_observations, False),
     place=1,
+    step_sizes=("learning_rate",),
 )

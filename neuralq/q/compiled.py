@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_choice
-from neuralq.q.bodies import ACTIVATIONS, Trunk
-from neuralq.q.engine import Engine, Loss, TorchEngine, check_actions, check_samples, check_single, no_target
+from neuralq.q.bodies import ACTIVATIONS, GroupedLinear, Trunk
+from neuralq.q.engine import Engine, Loss, TorchEngine, check_actions, check_samples, check_single, follow, no_target
 from neuralq.q.flat import FlatParameters
 from neuralq.q.kernels import batch as kernels
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
@@ -30,8 +30,8 @@ def runs_compiled(q: Any) -> bool:
     inner: Any = q.inner if type(q) is MaskedQ else q
     if type(inner) not in (ActionOutputQ, SeparateQ, ActionInputQ) or type(inner.trunk) is not Trunk:
         return False
-    # A stem has parameters, and so may a feature map of the user's: only autograd knows their gradient.
-    if any(True for _ in inner.input.parameters()):
+    # A stem has parameters, and so may a feature map of the user's: only autograd knows their gradient, and noise's.
+    if any(True for _ in inner.input.parameters()) or any(type(x) is not GroupedLinear for x in inner.trunk.layers):
         return False
     first: Tensor = next(inner.parameters())
     return first.device.type == "cpu" and first.dtype in (torch.float32, torch.float64)
@@ -170,17 +170,28 @@ class MlpEngine:
         q = self._loss_gradient(self._rows(s)[0], a.reshape(-1).numpy(), None, None, (kernels.VALUE, 1.0))
         return torch.from_numpy(q)[0]
 
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``."""
+        x = self._rows(s)[0]
+        if c.shape != (len(x), self._num_actions):
+            raise ValueError(f"coefficients must be one for each action of {len(x)} states, got {tuple(c.shape)}")
+        actions = np.tile(np.arange(self._num_actions), len(x))
+        each = np.repeat(x, self._num_actions, axis=0)
+        self._reserve(len(each))
+        weights = np.ascontiguousarray(c.to(self._dtype).numpy()).reshape(-1)
+        self._loss_gradient(each, actions, None, weights, (kernels.VALUE, 1.0))
+
     def _check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
         if self._mask is not None:
             check_actions(a, self._num_actions)
             self._mask.check_legal(s, a, weight)
 
-    def sync_target(self) -> None:
-        """Copy the parameters into the target copy."""
+    def sync_target(self, rate: float = 1.0) -> None:
+        """Move the target copy by this share of the way to the parameters; the first is a copy."""
         if self._target is None:
-            self._target = torch.empty_like(self.flat.values)
+            self._target = self.flat.values.clone()
             self._target_values = self._target.numpy()
-        self._target.copy_(self.flat.values)
+        follow(self._target, self.flat.values, rate)
 
     def target_values(self) -> Tensor | None:
         """The target copy's flat vector, or None."""

@@ -20,7 +20,7 @@ from neuralq.q.flat import FlatParameters
 from neuralq.q.masked import MaskedQ
 from neuralq.types import QFunction
 
-__all__ = ["Engine", "Loss", "TorchEngine", "check_actions", "check_samples", "check_single", "no_target"]
+__all__ = ["Engine", "Loss", "TorchEngine", "check_actions", "check_samples", "check_single", "follow", "no_target"]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,15 @@ class Engine(Protocol):
         """Q(s, a) ``[]`` of one state and action; leaves its gradient in ``flat.grad``."""
         ...
 
-    def sync_target(self) -> None:
-        """Copy the parameters into the target copy (made at the first call)."""
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``.
+
+        Coefficients of illegal actions must be 0.
+        """
+        ...
+
+    def sync_target(self, rate: float = 1.0) -> None:
+        """Move the target copy (made at the first call) by this share of the way to the parameters: 1 copies them."""
         ...
 
     def target_values(self) -> Tensor | None:
@@ -123,22 +130,35 @@ class TorchEngine:
         q.backward()  # type: ignore[no-untyped-call]
         return q.detach()
 
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``."""
+        self.flat.grad.zero_()
+        torch.where(c == 0, 0.0, self.q.all(s) * c).sum().backward()  # type: ignore[no-untyped-call]
+
     def network(self, target: bool = False) -> QFunction:
         """The module itself, or its target copy, for learners that need more of it than action values."""
         if target and self._target is None:
             raise no_target()
         return cast(QFunction, self._target) if target else self.q
 
-    def sync_target(self) -> None:
-        """Copy the parameters into the target copy."""
+    def sync_target(self, rate: float = 1.0) -> None:
+        """Move the target copy by this share of the way to the parameters; the first is a copy."""
         if self._target_flat is None:
             target = copy.deepcopy(cast(nn.Module, self.q))
             self._target, self._target_flat = cast(QFunction, target), FlatParameters(target)
-        self._target_flat.values.copy_(self.flat.values)
+        follow(self._target_flat.values, self.flat.values, rate)
 
     def target_values(self) -> Tensor | None:
         """The target copy's flat vector, or None."""
         return None if self._target_flat is None else self._target_flat.values
+
+
+def follow(target: Tensor, values: Tensor, rate: float) -> None:
+    """Target ← target + rate · (values − target), a copy where the rate is 1."""
+    if rate == 1.0:
+        target.copy_(values)
+    else:
+        target.lerp_(values, rate)
 
 
 def no_target() -> ValueError:

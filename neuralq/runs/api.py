@@ -14,7 +14,7 @@ from neuralq.runs.recipe.config import RunConfig, config_from_dict
 from neuralq.runs.recipe.games import make_single
 from neuralq.runs.recipe.handed import Handed, handed_over
 from neuralq.runs.recipe.keywords import nested, with_body
-from neuralq.runs.recipe.presets import preset_for, with_preset
+from neuralq.runs.recipe.presets import of_agent, started, with_preset
 from neuralq.runs.recipe.stand_in import Maker, standing_in
 from neuralq.runs.stop_request import pass_on
 
@@ -25,7 +25,12 @@ _makers: dict[Path, Maker] = {}
 
 
 def train(
-    env: Any, run_dir: str | Path | None = None, hooks: Sequence[Hook] = (), *, preset: bool = True, **settings: Any
+    env: Any,
+    run_dir: str | Path | None = None,
+    hooks: Sequence[Hook] = (),
+    *,
+    preset: bool | str = True,
+    **settings: Any,
 ) -> Run:
     """Train, and leave a run folder: configuration, versions, metrics and checkpoints.
 
@@ -38,7 +43,7 @@ def train(
             settings with one of these as ``env``; or a whole `RunConfig`. An environment is copied and not touched.
         run_dir: folder for the run; by default one under ``runs/``, named after environment, layout, seed and time.
         hooks: called with every row of metrics, and shown the session where they ask for it (docs/hooks.md).
-        preset: whether to start from the preset.
+        preset: whether to start from the environment's preset; or the name of a whole agent, such as "rainbow".
         settings: fields of `RunConfig`; settings of the learner by their own names (``lambda_=0.8``); and ``hidden``,
             ``layer_norm`` and ``activation`` of the network.
 
@@ -57,8 +62,9 @@ def train(
         True
     """
     config, handed = _asked(env, settings, preset)
-    if preset and not isinstance(env, RunConfig) and preset_for(config.env, config.learner):
-        _tell(hooks, f"preset for {config.env}, {config.learner} learner (preset=False leaves it out)")
+    begun = started(config.env, config.learner, preset if isinstance(preset, str) else None)
+    if preset and not isinstance(env, RunConfig) and begun:
+        _tell(hooks, f"{begun} (preset=False leaves it out)")
     with standing_in(handed.make):
         run: Run = CONTROL.train(config, run_dir, hooks)
     if handed.make is not None:
@@ -67,13 +73,13 @@ def train(
     return run
 
 
-def _asked(env: Any, settings: Mapping[str, Any], preset: bool) -> tuple[RunConfig, Handed]:
+def _asked(env: Any, settings: Mapping[str, Any], preset: bool | str) -> tuple[RunConfig, Handed]:
     """The configuration that arguments of `train` come to, and its environment."""
     if isinstance(env, RunConfig):
         plain = nested(env, settings)
         preset = False
     else:
-        plain = nested(env if isinstance(env, Mapping) else {"env": env}, settings)
+        plain = nested(of_agent(env if isinstance(env, Mapping) else {"env": env}, preset, settings), settings)
     handed = handed_over(plain.get("env", RunConfig.env))
     plain["env"] = handed.env
     if handed.env_kwargs:
@@ -83,7 +89,9 @@ def _asked(env: Any, settings: Mapping[str, Any], preset: bool) -> tuple[RunConf
             f"env_kwargs are for environments that a name leads to, and {handed.env} is made by what was handed over; "
             "give it its arguments there"
         )
-    return (with_preset(plain) if preset else config_from_dict(with_body(plain))), handed
+    if not preset:
+        return config_from_dict(with_body(plain)), handed
+    return with_preset(plain, preset=preset if isinstance(preset, str) else None), handed
 
 
 def _tell(hooks: Sequence[Hook], line: str) -> None:
@@ -160,12 +168,15 @@ def _passed_on(run: Any) -> Any:
     return run
 
 
-def load(run_dir: str | Path | Run, best: bool = False, *, env: Any = None) -> Any:
-    """The agent of a run's newest checkpoint, or of its best evaluation.
+def load(run_dir: str | Path | Run, best: bool | None = None, *, env: Any = None) -> Any:
+    """The agent of a run: its last parameters, or its best where those are what the run ended with.
+
+    A run that ends below its best evaluation plays both on fresh episodes and keeps the last, unless the best is better
+    by more than the standard error of the difference.
 
     Args:
         run_dir: folder of the run, or the run itself.
-        best: the parameters whose greedy evaluation scored highest, in place of the newest.
+        best: True for the parameters whose greedy evaluation scored highest, False for the last.
         env: the environment, as `train` takes it, of a run in whose folder it has no name that could be followed.
 
     Returns:

@@ -17,14 +17,16 @@ from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
 from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
+from neuralq.runs.beside import DRAWING_NAME, Beside, Comparison
 from neuralq.runs.evaluation import MOST_STEPS, Evaluation, evaluate_greedy, shown
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
-from neuralq.runs.folder.files import read_rows
+from neuralq.runs.folder.files import plain_values, read_rows, to_json, write_durably
 from neuralq.runs.folder.origin import compared
-from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_config
+from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.recipe.build import (
     build_q,
     build_session,
@@ -32,15 +34,16 @@ from neuralq.runs.recipe.build import (
     normalisation_for,
     plan_of,
 )
-from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, RunConfig, config_from_dict, config_to_dict
 from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.runs.warm_start import begun_from
 
-__all__ = ["CONTROL", "Run", "evaluate_run", "last_cap"]
+__all__ = ["CONTROL", "Run", "agent_of", "evaluate_run", "last_cap"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,12 @@ class Run:
         resumability: how exactly it can be resumed, in words.
         engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
         stopped_by: which hook ended it before its budget was spent, and why; None if none did.
+        agent: which parameters `neuralq.load` takes where nothing is said: "final" or "best".
+        play_off: of a run that ended below its best evaluation, what that was decided by
+            (`neuralq.runs.evaluation.play_off`); else None.
+        exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
+        measured: what it learned that is no value of an action: of prediction the start's value and the distance from
+            exact values, of R-learning the reward per step; empty for others.
     """
 
     run_dir: Path
@@ -72,6 +81,10 @@ class Run:
     resumability: str
     engine: str
     stopped_by: str | None = None
+    agent: str = "final"
+    play_off: dict[str, Any] | None = None
+    exact: dict[str, Any] | None = None
+    measured: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -79,18 +92,26 @@ class Run:
 
     def lines(self) -> list[str]:
         """The same for people."""
-        score = "not evaluated" if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
+        score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
         )
-        return [
+        lines = [
             f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}",
+            *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
         ]
+        if self.play_off is not None:
+            lines.append(_about_play_off(self.play_off))
+        return lines if self.exact is None else [*lines, *Comparison(**self.exact).lines()]
 
 
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
+    play_off = progress.agent
+    agent = "final" if play_off is None else str(play_off["agent"])
+    exact = _beside_exact(session, folder, agent)
     return Run(
         run_dir=folder.named,
         env_steps=session.env_steps,
@@ -103,10 +124,56 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         resumability=session.resumability.reason if progress.moved is None else f"{NOT_EXACT}: {progress.moved}",
         engine=engine_name(session.learner),
         stopped_by=progress.stopped_by,
+        agent=agent,
+        play_off=play_off,
+        exact=exact,
+        measured=session.measures(),
     )
 
 
-def _load_agent(run_dir: str | Path, best: bool) -> Agent:
+def _about_play_off(found: Mapping[str, Any]) -> str:
+    best, final = shown(found["best_return"]), shown(found["final_return"])
+    which = (
+        "the best are the run's agent, --final takes the last"
+        if found["agent"] == "best"
+        else "the last are the run's agent, for the difference may be chance; --best takes the others"
+    )
+    return (
+        f"it ended below its best evaluation, at {found['best_env_steps']:,} steps; over {found['num_episodes']} fresh "
+        f"episodes the last parameters score {final}, the best {best}, ± {found['standard_error']:.2g} between them: "
+        f"{which}"
+    )
+
+
+def _beside_exact(session: Session, folder: RunFolder, agent: str) -> dict[str, Any] | None:
+    """What the agent learned beside the exact answer; what a picture is drawn from is left in the folder."""
+    beside = session.beside
+    if beside is None:
+        return None
+    with session.playing_with(load_best(folder.path) if agent == "best" else None):
+        values = session.learner.engine.all, session.value_scale
+        found, drawing = beside.compare(*values), beside.drawing(*values)
+    if drawing is not None:
+        write_durably(
+            folder.path / DRAWING_NAME, to_json(plain_values(drawing, DRAWING_NAME), DRAWING_NAME, sealed=True)
+        )
+    return None if found is None else found.plain()
+
+
+def agent_of(run_dir: str | Path) -> str:
+    """Which parameters are the agent of a run: "final", or "best" where the run ended with those.
+
+    Raises:
+        CheckpointError: if no checkpoint is intact.
+    """
+    return _agent_in(checkpoint.load_newest(Path(run_dir) / "checkpoints").state)
+
+
+def _agent_in(state: Mapping[str, Any]) -> str:
+    return str((state["progress"].get("agent") or {"agent": "final"})["agent"])
+
+
+def _load_agent(run_dir: str | Path, best: bool | None) -> Agent:
     config = config_from_dict(read_config(run_dir))
     parameters, statistics, scalings = _kept(Path(run_dir), best)
     envs = make_envs(config, 1)
@@ -126,14 +193,19 @@ def _load_agent(run_dir: str | Path, best: bool) -> Agent:
         envs.close()
 
 
-def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
+def _kept(run_dir: Path, best: bool | None) -> tuple[Tensor, Any, Any]:
     """The flat parameters, and the statistics and the scales through which observations were seen."""
-    if best:
-        kept = load_best(run_dir)
+    newest = None if best else checkpoint.load_newest(run_dir / "checkpoints")
+    if newest is None or (best is None and _agent_in(newest.state) == "best"):
+        try:
+            kept = load_best(run_dir)
+        except checkpoint.CheckpointError as error:
+            if best:
+                raise
+            raise checkpoint.CheckpointError(f"{error}; these are the run's agent, --final takes the last") from error
         return kept.parameters, kept.normalisation, kept.scalings
-    newest = checkpoint.load_newest(run_dir / "checkpoints")
     saved = newest.state
-    compared(saved.get("origin"), read_config(run_dir), newest.path)
+    compared(saved.get("origin"), read_config(run_dir), newest.path, read_changes(run_dir))
     state = saved["learner"]
     parameters = state["parameters"] if "parameters" in state else state["descent"]["parameters"]
     if state.get("average") is not None:
@@ -141,18 +213,30 @@ def _kept(run_dir: Path, best: bool) -> tuple[Tensor, Any, Any]:
     return torch.as_tensor(parameters), saved["stream"].get("normalisation"), saved["stream"].get("scalings")
 
 
-def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool = False) -> Evaluation:
-    """Greedy returns of a run's newest checkpoint, or of its best evaluation, on fresh episodes.
+def _chosen(run_dir: Path) -> Agent:
+    return _load_agent(run_dir, None)
+
+
+def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, best: bool | None = None) -> Evaluation:
+    """Greedy returns of a run's agent (`neuralq.load`), on fresh episodes.
 
     Args:
         run_dir: folder of the run.
         num_episodes: how many episodes.
         seed: of the episodes; unrelated to those seen in training.
-        best: play with the parameters whose greedy evaluation scored highest, in place of the newest.
+        best: True to play with the parameters whose greedy evaluation scored highest, False with the last.
+
+    Raises:
+        ValueError: if the run has learned no policy.
     """
     check_whole("num_episodes", num_episodes)
     check_whole("seed", seed, 0)
     config = config_from_dict(read_config(run_dir))
+    if not getattr(config.settings, "acts", True):
+        raise ValueError(
+            f"{run_dir} predicts and has no policy that could be played; its metrics have what it learned: "
+            f"neuralq report {run_dir}"
+        )
     agent = _load_agent(run_dir, best)
     with limited_threads(config.threads):
         envs = make_evaluation_envs(config, min(num_episodes, 64))
@@ -160,7 +244,15 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
             stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
             with torch.no_grad():
                 most = config.evaluation_max_steps or last_cap(run_dir)
-                return evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
+                found = evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)
+            discounts = getattr(config.settings, "discounts", True)
+            beside = Beside.of(envs, stream.spec, config.gamma, config.exact) if discounts else None
+            if beside is None:
+                return found
+            beside.load_state_dict(checkpoint.load_newest(Path(run_dir) / "checkpoints").state.get("met"))
+            return dataclasses.replace(
+                found, about_exact=beside.look(), exact=beside.compare(agent.q.all, agent.reward_scale)
+            )
         finally:
             envs.close()
 
@@ -174,7 +266,8 @@ def last_cap(run_dir: str | Path) -> int:
 
 def _opening(config: RunConfig, session: Session) -> list[str]:
     warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
-    return [*opening_lines(session.stream), *warned]
+    told = [session.stream.told] if isinstance(session.stream, Playback) else []
+    return [*told, *opening_lines(session.stream), *warned]
 
 
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
@@ -185,18 +278,22 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
             notes.append(f"{label} {latest[name]:.3g}")
     if "episode_return" in latest:
         notes.append(f"return {shown(latest['episode_return'])}")
+    if "q_error_mean" in latest:
+        notes.append(f"|Q − Q*| {latest['q_error_mean']:.3g}, regret {latest['regret']:.3g}")
     if "greedy_return" in latest:
         goal = "" if config.stop_at_return is None else f" (target {config.stop_at_return:g})"
         notes.append(f"greedy {shown(latest['greedy_return'])}{goal}")
+    notes += [f"{name.replace('_', ' ')} {latest[name]:.3g}" for name in _MEASURES if name in latest]
     if latest.get("num_cut"):
         notes.append(f"{latest['num_cut']} of {len(latest['returns'])} evaluation episodes cut")
     return notes
 
 
+_MEASURES = ("value_error_rms", "average_reward")
 _CHANGEABLE = frozenset(
     "stop_at_return evaluate_every evaluation_episodes evaluation_max_steps checkpoint_every log_every "
-    "resume_probe".split()
-)
+    "resume_probe exact monitor".split()
+) | {f"{name}.{setting}" for name, kind in LEARNERS.items() for setting in kind.step_sizes}
 CONTROL = Kind(
     name="control",
     title="a run on an environment",
@@ -213,4 +310,5 @@ CONTROL = Kind(
     notes=_notes,
     changeable=_CHANGEABLE,
     opening=_opening,
+    start=lambda config, session: config if config.warm_start is None else begun_from(config, session, _chosen),
 )

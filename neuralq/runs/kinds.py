@@ -21,9 +21,10 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from threadpoolctl import threadpool_limits
 
+from neuralq.runs.changes import differences, names_of_changes, replaced, told, with_new_periods
 from neuralq.runs.folder.files import RunFolderError
 from neuralq.runs.folder.origin import ARITHMETIC
-from neuralq.runs.folder.run_folder import RunFolder, claimed, is_run_folder, read_config, refuse_old_run
+from neuralq.runs.folder.run_folder import RunFolder, claimed, is_run_folder, read_changes, read_config, refuse_old_run
 from neuralq.runs.loop import Hook, Plan, Progress, Speaks, Trainee, continued, fit, say_to
 from neuralq.runs.stop_request import StopRequest
 
@@ -92,12 +93,16 @@ class Kind(Generic[C, T, R]):
         build: what trains, freshly made, with compiled kernels warm.
         plan: when a run is evaluated, saved and stopped.
         result: of a run that has ended, which is told by the name it was given; may leave files there.
-        load: the agent of a run folder; of the best parameters, if that is asked and they are kept.
+        load: the agent of a run folder; of the best parameters, if that is asked and they are kept, of the last, or
+            with None of those that the run ended with.
         opening: what is worth saying of a run, once, before it trains; what begins with "warning: " is said to whoever
             listens to nothing else, too.
         notes: what is worth saying beside a progress bar, of the latest value of each column of metrics.
-        changeable: fields that do not decide what is learned: a run may go on with other values.
+        changeable: fields, with a dot those of a part, that a run may go on with otherwise than it began; those of a
+            part decide what is learned from there on.
         command: what the command line has to know to train by options of the kind's own.
+        start: puts what was freshly built where its configuration says that a run begins; the configuration as it is
+            to be kept.
     """
 
     name: str
@@ -111,15 +116,16 @@ class Kind(Generic[C, T, R]):
     build: Callable[[C], T]
     plan: Callable[[C], Plan]
     result: Callable[[C, T, Progress, RunFolder], R]
-    load: Callable[[Path, bool], Any]
+    load: Callable[[Path, bool | None], Any]
     notes: Callable[[C, Mapping[str, Any]], list[str]]
     changeable: frozenset[str] = frozenset()
     command: CommandLine | None = None
     opening: Callable[[C, T], list[str]] | None = None
+    start: Callable[[C, T], C] = lambda config, trainee: config
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
-        plain, seed, request = self.to_plain(config), self.plan(config).seed, StopRequest()
+        seed, request = self.plan(config).seed, StopRequest()
         with claimed(run_dir, lambda: self.default_path(config)) as path, same_folder() as here:
             refuse_old_run(path)  # `RunFolder.create` does too, but building takes seconds
             with (
@@ -128,7 +134,8 @@ class Kind(Generic[C, T, R]):
                 contextlib.closing(self.build(config)) as trainee,
             ):
                 _end_if_asked(request)
-                with RunFolder.create(here / path, config=plain, seed=seed) as folder:
+                config = self.start(config, trainee)
+                with RunFolder.create(here / path, config=self.to_plain(config), seed=seed) as folder:
                     folder.named = path
                     folder.free = self.free
                     result = self._finish(config, trainee, Progress(), folder, hooks)
@@ -154,27 +161,38 @@ class Kind(Generic[C, T, R]):
         ):
             _end_if_asked(request)
             folder.free, folder.named = self.free, Path(run_dir)
+            if not any(folder.checkpoints_path.glob("step-*")):
+                self.start(config, trainee)
             progress = continued(trainee, folder)
             plan, before = self.plan(config), self.plan(stored)
             if trainee.amount > plan.budget and plan.budget < before.budget:
                 raise ValueError(
-                    f"{self.budget}={budget} is less than what {run_dir} has spent, {trainee.amount:,}; name more than "
-                    "that, or leave it out"
+                    f"{self.budget}={plan.budget} is less than what {run_dir} has spent, {trainee.amount:,}; name more "
+                    "than that, or leave it out"
                 )
             if plan.stop_at_return != before.stop_at_return:
                 score, target = progress.greedy_return, plan.stop_at_return
                 met = score is not None and target is not None and score >= target
                 progress.reached_at = progress.evaluated_at if met else None
+            with_new_periods(progress, before, plan, trainee.amount)
             if config != stored:
-                folder.replace_config(self.to_plain(config))
+                self._record(stored, config, trainee, folder, hooks)
             result = self._finish(config, trainee, progress, folder, hooks)
             _end_if_asked(request)
             return result
 
+    def _record(self, stored: C, config: C, trainee: T, folder: RunFolder, hooks: Sequence[Hook]) -> None:
+        """What changes is kept in the folder and said, before anything goes on with it."""
+        names = set(names_of_changes(stored, self.may_change()).values())
+        changes = differences(stored, config, names)
+        folder.record_changes(trainee.env_steps, changes)
+        folder.replace_config(self.to_plain(config))
+        say_to(hooks, told({"env_steps": trainee.env_steps, "changes": changes}))
+
     @property
     def free(self) -> frozenset[str]:
         """Names of the configuration that do not decide what is learned."""
-        return self.changeable | {self.budget}
+        return frozenset(name for name in self.changeable if "." not in name) | {self.budget}
 
     def changed(self, config: C, budget: int | None, changes: Changes = NO_CHANGES) -> C:
         """The same configuration but for how much training there is, and what else does not decide what is learned.
@@ -182,15 +200,26 @@ class Kind(Generic[C, T, R]):
         Raises:
             ValueError: for anything else, which would make another run of it.
         """
-        known = self.changeable | (ARITHMETIC & {f.name for f in dataclasses.fields(self.config)})  # type: ignore[arg-type]
-        for name in changes:
-            if name not in known:
-                raise ValueError(
-                    f"{name} cannot be changed where {self.title} goes on: it would be another run; what can is "
-                    f"{', '.join(sorted(known))}"
-                )
-        values = dict(changes) | ({} if budget is None else {self.budget: budget})
-        return dataclasses.replace(config, **values)  # type: ignore[type-var]  # it is a dataclass
+        values = {self.full_name(config, name): value for name, value in changes.items()}
+        return replaced(config, values | ({} if budget is None else {self.budget: budget}))
+
+    def full_name(self, config: C, name: str) -> str:
+        """The name of a setting that may change, with its part where it is in one.
+
+        Raises:
+            ValueError: if it may not, with what may.
+        """
+        known = names_of_changes(config, self.may_change())
+        if name not in known:
+            raise ValueError(
+                f"{name} cannot be changed where {self.title} goes on: it would be another run; what can is "
+                f"{', '.join(sorted(set(known.values())))}"
+            )
+        return known[name]
+
+    def may_change(self) -> frozenset[str]:
+        """Names of all that may be otherwise where a run goes on."""
+        return self.changeable | {self.budget} | (ARITHMETIC & {f.name for f in dataclasses.fields(self.config)})  # type: ignore[arg-type]
 
     def _finish(self, config: C, trainee: T, progress: Progress, folder: RunFolder, hooks: Sequence[Hook]) -> R:
         plan = self.plan(config)
@@ -204,7 +233,8 @@ class Kind(Generic[C, T, R]):
         else:
             warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)
-        folder.write_summary(result.plain())
+        changes = read_changes(folder.path)
+        folder.write_summary(result.plain() | ({"changes": changes} if changes else {}))
         return result
 
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from neuralq.learners.learner import Learner
 from neuralq.runs.folder import checkpoint, origin
-from neuralq.runs.folder.best import Best, keep_best
-from neuralq.runs.folder.run_folder import RunFolder, warn_of_lost_rows
+from neuralq.runs.folder.best import Best, keep_best, load_best
+from neuralq.runs.folder.checkpoint import CheckpointError
+from neuralq.runs.folder.run_folder import RunFolder, read_changes, warn_of_lost_rows
 from neuralq.runs.stop_request import StopAsked, StopRequest
 from neuralq.runs.stream.experience import Sample
 from neuralq.runs.watching import Hook, HookFault, Listener, Observer, Watch, say_to
@@ -30,6 +31,7 @@ __all__ = [
     "Listener",
     "Observer",
     "Plan",
+    "PlaysOff",
     "Progress",
     "Speaks",
     "Trainee",
@@ -52,6 +54,15 @@ class Speaks(Protocol):
 
 class Diverged(RuntimeError):
     """The parameters are no longer finite numbers; the last checkpoint is from before that."""
+
+
+@runtime_checkable
+class PlaysOff(Protocol):
+    """A trainee whose last parameters can be held against its best."""
+
+    def play_off(self, best: Best, seed: int) -> dict[str, Any]:
+        """Which of both is the agent of the run ("agent": "final" or "best"), and what that was decided by."""
+        ...
 
 
 class Trainee(Protocol):
@@ -151,6 +162,8 @@ class Progress:
         stopped_by: which hook ended it early, and why.
         moved: what decides the arithmetic and was not the same all along, in words.
         hook_states: what hooks have to remember, by name.
+        agent: of a finished run that ended below its best evaluation: which of both is its agent, and by what that was
+            decided (`PlaysOff`); None where the last parameters are.
     """
 
     cpu_seconds: float = 0.0
@@ -167,6 +180,7 @@ class Progress:
     stopped_by: str | None = None
     moved: str | None = None
     hook_states: dict[str, Any] = field(default_factory=dict)
+    agent: dict[str, Any] | None = None
 
 
 def seed_for(seed: int, *purpose: int) -> int:
@@ -192,7 +206,7 @@ def continued(trainee: Trainee, folder: RunFolder) -> Progress:
         return Progress()
     saved = checkpoint.load_newest(folder.checkpoints_path)
     state = saved.state
-    moved = origin.compared(state.get("origin"), folder.config, saved.path)
+    moved = origin.compared(state.get("origin"), folder.config, saved.path, read_changes(folder.path))
     trainee.load_state_dict(state)
     folder.truncate_metrics(trainee.env_steps)
     warn_of_lost_rows(folder.path, folder.num_rows, state["progress"].get("num_rows"))
@@ -250,7 +264,7 @@ class _Loop:
     def __init__(self, trainee: Trainee, plan: Plan, progress: Progress, folder: RunFolder, watch: Watch) -> None:
         self.trainee, self.plan, self.progress, self.folder, self.watch = trainee, plan, progress, folder, watch
         progress.finished = False
-        progress.interrupted_by = progress.stopped_by = None
+        progress.interrupted_by = progress.stopped_by = progress.agent = None
         progress.next_evaluation = progress.next_evaluation or plan.evaluate_every
         progress.next_checkpoint = progress.next_checkpoint or plan.checkpoint_every
         if plan.log_whole_periods:
@@ -285,6 +299,7 @@ class _Loop:
                 self._save(request)
         if progress.evaluated_at != trainee.amount:
             self._evaluate(request)
+        self._choose_agent(request)
         progress.finished = True
         self._save(request)
 
@@ -294,6 +309,26 @@ class _Loop:
         reached = self.plan.stop_at_return is not None and progress.reached_at is not None
         self.watch.ended_by = progress.interrupted_by or progress.stopped_by or ("target" if reached else "budget")
         self.watch.call("on_end")
+
+    def _choose_agent(self, request: StopRequest) -> None:
+        """Where the last evaluation was not the best, both play on, and the better is the agent of the run."""
+        trainee, progress = self.trainee, self.progress
+        last, best = progress.greedy_return, progress.best_return
+        if last is None or best is None or last >= best or not isinstance(trainee, PlaysOff):
+            return
+        try:
+            kept = load_best(self.folder.path)
+        except CheckpointError:  # deleted meanwhile
+            return
+        self._book()
+        try:
+            with request.abandoning():
+                progress.agent = trainee.play_off(kept, seed_for(self.plan.seed, 12, trainee.amount))
+        except KeyboardInterrupt:  # asked twice, as in an evaluation
+            self._book(training=False)
+            self.interrupted(request)
+            raise
+        self._book(training=False)
 
     def interrupted(self, request: StopRequest) -> None:
         self.progress.interrupted_by = request.name

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,17 +16,20 @@ import torch
 from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.agent import Agent
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy
+from neuralq.runs.beside import Beside
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy, play_off
 from neuralq.runs.folder.best import Best
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.stream import Interaction, Policy, Step
+from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.runs.stream.experience import ExperienceSource, Sample
+from neuralq.runs.stream.table import TableWalk
 from neuralq.types import Array
 
 __all__ = ["Session", "cap_on_evaluation"]
@@ -36,9 +40,9 @@ class Session:
     """The mutable parts of a run on an environment; a `neuralq.runs.loop.Trainee`.
 
     Args:
-        stream: experience from the training environments.
-        policy: the behaviour.
-        experience: between stream and learner.
+        stream: experience from the training environments; or a walk, which acts and learns by itself.
+        policy: the behaviour; None with a walk.
+        experience: between stream and learner; None with a walk.
         learner: what learns.
         generators: every generator in use, by name.
         make_evaluation: makes an interaction with environments of its own for evaluation; called when first needed.
@@ -50,11 +54,12 @@ class Session:
         evaluate_every: environment steps between evaluations.
         value_range: the smallest and the largest return that the learner can represent, where it cannot represent all.
         reward_scale: by what the learner multiplies rewards; metrics are in the environment's units.
+        beside: holds what is learned against the exact answer, where the environment has a model.
     """
 
-    stream: Interaction
-    policy: Policy
-    experience: ExperienceSource
+    stream: Interaction | TableWalk | Playback
+    policy: Policy | None
+    experience: ExperienceSource | None
     learner: Learner
     generators: dict[str, np.random.Generator]
     make_evaluation: Callable[[], Interaction]
@@ -65,20 +70,23 @@ class Session:
     evaluate_every: int
     reward_scale: float = 1.0
     value_range: tuple[float, float] | None = None
+    beside: Beside | None = None
     _evaluation: Interaction | None = field(init=False, default=None)
     _cannot_evaluate: bool = field(init=False, default=False)
     _longest: int = field(init=False, default=0)
     _recent_returns: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=100))
     _last: tuple[Update, Sample] | None = field(init=False, default=None)
     _metrics_before: dict[str, float] = field(init=False, default_factory=dict)
-    say: Callable[[str], None] = field(init=False, default=lambda line: None)
+    say: Callable[[str], None] = field(init=False, default_factory=lambda: _unheard)
     _early: EarlyReturns | None = field(init=False, default=None)
     on_step: Callable[[], None] | None = field(init=False, default=None)
     on_update: Callable[[], None] | None = field(init=False, default=None)
     last_step: Step | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        """Watch the first returns where some of them cannot be represented."""
+        """Watch the first returns where some of them cannot be represented, and what is met where that is compared."""
+        if self.beside is not None:
+            self.beside.watch()
         if self.value_range is not None:
             stream = self.stream
             self._early = EarlyReturns(
@@ -113,17 +121,21 @@ class Session:
 
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
+        if isinstance(self.stream, TableWalk):
+            self._walk(self.stream, until, request)
+            return
         stream, experience, learner = self.stream, self.experience, self.learner
-        device = learner.engine.flat.values.device
+        assert self.policy is not None and experience is not None
+        device, beside = learner.engine.flat.values.device, self.beside
         on_cpu = device.type == "cpu"
         while True:
             step = self.last_step = stream.step(self.policy)
             experience.add(step)
+            if beside is not None:
+                beside.see(step.rows[0], step.rows[1])
             if self._early is not None:
                 self._early = self._early.add(step)
-            for episode in step.episodes:
-                self._recent_returns.append(episode.episode_return)
-                self._longest = max(self._longest, episode.length)
+            self._count(step.episodes)
             if self.on_step is not None:
                 self.on_step()
             for sample in experience.draw():
@@ -137,6 +149,23 @@ class Session:
             if experience.between_samples and (stream.num_steps >= until or request.name is not None):
                 return
 
+    def _walk(self, walk: TableWalk, until: int, request: StopRequest) -> None:
+        """A walk learns as it goes, so whoever wants to see its steps sees them when they have been learned from."""
+        watched = list(filter(None, (self.on_step, self.on_update)))
+        while walk.num_steps < until and request.name is None:
+            self._count(walk.advance(walk.num_steps + 1 if watched else until, request))
+            if watched:
+                self.last_step = walk.last_step()
+            for tell in watched:
+                tell()
+        if self.beside is not None and self.beside.visited is not None:
+            self.beside.see(*walk.met())
+
+    def _count(self, episodes: Iterable[Episode]) -> None:
+        for episode in episodes:
+            self._recent_returns.append(episode.episode_return)
+            self._longest = max(self._longest, episode.length)
+
     def training_row(self) -> dict[str, Any]:
         """Mean return of recent episodes, number of updates, and what the last one saw."""
         recent = float(np.mean(self._recent_returns)) if self._recent_returns else None
@@ -144,13 +173,11 @@ class Session:
 
     def _last_metrics(self) -> dict[str, float]:
         """Of the last update, which may have been before the run was resumed, in the environment's units."""
-        if self._last is None:
+        update = self.last_update
+        if update is None:
             return self._metrics_before
         scale = self.value_scale
-        return {
-            name: value / (scale * scale if name == "loss" else scale)
-            for name, value in self._last[0].metrics().items()
-        }
+        return {name: value / (scale * scale if name == "loss" else scale) for name, value in update.metrics().items()}
 
     @property
     def value_scale(self) -> float:
@@ -160,7 +187,9 @@ class Session:
 
     @property
     def last_update(self) -> Update | None:
-        """What the last update saw."""
+        """What the last update saw; of a walk, what the values of the moment say of its last steps."""
+        if isinstance(self.stream, TableWalk):
+            return self.stream.last_update()
         return None if self._last is None else self._last[0]
 
     @property
@@ -172,7 +201,8 @@ class Session:
         """Action values of observations in the environment's units, with the parameters that the learner plays with."""
         stream = self.stream
         seen = None if stream.normalisation is None else stream.normalisation.frozen()
-        _, first_action = discrete_actions(stream.envs.single_action_space)
+        space = stream.envs.action_space if isinstance(stream, TableWalk) else stream.envs.single_action_space
+        _, first_action = discrete_actions(space)
         agent = Agent(self.learner.engine.q, stream.encoder, stream.spec, first_action, self.value_scale, seen)
         with evaluating_with(self.learner):
             return agent.values(observation)
@@ -186,26 +216,83 @@ class Session:
     def play_greedily(self, seed: int) -> Evaluation:
         """Greedy episodes with the parameters that the learner plays with."""
         with evaluating_with(self.learner):
-            return evaluate_greedy(
-                self.learner.engine.all, self.evaluation_stream, self.evaluation_episodes, seed,
-                self._cap(),
-            )  # fmt: skip
+            return self._play(self.evaluation_episodes, seed)
+
+    def _play(self, num_episodes: int, seed: int) -> Evaluation:
+        return evaluate_greedy(self.learner.engine.all, self.evaluation_stream, num_episodes, seed, self._cap())
+
+    @contextlib.contextmanager
+    def playing_with(self, best: Best | None) -> Iterator[None]:
+        """Within the block values are those of other parameters, seen through their statistics; afterwards as before.
+
+        Args:
+            best: whose; None for those that the learner plays with.
+        """
+        flat, seen = self.learner.engine.flat.values, self.stream.normalisation
+        if best is None:
+            with evaluating_with(self.learner):
+                yield
+            return
+        learned, statistics = flat.clone(), None if seen is None else copy.deepcopy(seen.state_dict())
+        flat.copy_(best.parameters)
+        if seen is not None and best.normalisation is not None:
+            seen.load_state_dict(best.normalisation)
+        try:
+            yield
+        finally:
+            flat.copy_(learned)
+            if seen is not None and statistics is not None:
+                seen.load_state_dict(statistics)
+
+    def play_off(self, best: Best, seed: int) -> dict[str, Any]:
+        """The last and the best parameters on the same fresh episodes; the rule is `neuralq.runs.evaluation.play_off`.
+
+        There are up to 100 episodes, and together no more than half the steps of training, in rounds as long as an
+        evaluation; one round there is in any case.
+        """
+
+        def play(which: Best | None, num_episodes: int, at: int) -> Evaluation:
+            with self.playing_with(which):
+                return self._play(num_episodes, at)
+
+        found = play_off(
+            lambda n, at: play(None, n, at), lambda n, at: play(best, n, at), max(2, self.evaluation_episodes),
+            self.env_steps // 2, seed,
+        )  # fmt: skip
+        return {**found, "best_env_steps": best.env_steps}
 
     def evaluate(self, seed: int) -> tuple[dict[str, Any], Best | None]:
         """Returns of greedy episodes, and the parameters that played them.
 
         An environment that can exist only once is not evaluated, which a warning says.
         """
+        measured = self.measures()
+        if not getattr(getattr(self.learner, "settings", None), "acts", True):
+            return measured, None
         if not self._can_evaluate():
-            return {}, None
+            return measured, None
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
         columns["num_cut"] = found.num_cut
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
+        columns |= measured | self._beside_exact()
         scalings = self.stream.encoder.scalings
         return columns, Best(self.env_steps, found.mean, evaluation_parameters(self.learner), statistics, scalings)
+
+    def measures(self) -> dict[str, float]:
+        """What a learner of something else than action values has learned; empty for others."""
+        return self.stream.measures() if isinstance(self.stream, TableWalk) else {}
+
+    def _beside_exact(self) -> dict[str, Any]:
+        """Columns on what is learned beside the exact answer."""
+        if self.beside is None:
+            return {}
+        if (line := self.beside.look()) is not None:
+            self.say(line)
+        with evaluating_with(self.learner):
+            return self.beside.columns(self.learner.engine.all, self.value_scale)
 
     def _cap(self) -> int:
         if self.evaluation_max_steps is not None:
@@ -250,16 +337,19 @@ class Session:
                 "longest_episode": self._longest,
             },
             "learner": self.learner.state_dict(),
-            "feed": self.experience.state_dict(),
+            "feed": {} if self.experience is None else self.experience.state_dict(),
             "stream": self.stream.state_dict(),
             "environments": self._environments(),
             "generators": {name: rng.bit_generator.state for name, rng in self.generators.items()},
+            "met": None if self.beside is None else self.beside.state_dict(),
         }
 
     def _environments(self) -> dict[str, Any] | None:
         """The environments' own state; None where it cannot be taken, or no longer can."""
         if not self.resumability.exact:
             return None
+        if isinstance(self.stream, TableWalk | Playback) and self.stream.simulated:
+            return {}
         try:
             return encode_env(self.stream.envs)
         except NotCopyable as error:
@@ -281,7 +371,10 @@ class Session:
         self._metrics_before = progress["last_metrics"]
         self._longest = int(progress.get("longest_episode", 0))
         self.learner.load_state_dict(state["learner"])
-        self.experience.load_state_dict(state["feed"])
+        if self.beside is not None:
+            self.beside.load_state_dict(state.get("met"))
+        if self.experience is not None:
+            self.experience.load_state_dict(state["feed"])
         for name, rng in self.generators.items():
             rng.bit_generator.state = state["generators"][name]
         if self._restored(state["environments"]):
@@ -293,8 +386,8 @@ class Session:
             self.learner.begin_streams()
 
     def _restored(self, environments: Mapping[str, Any] | None) -> bool:
-        if environments is None:
-            return False
+        if not environments:  # none where a model is simulated
+            return environments is not None
         try:
             restore_env(self.stream.envs, environments)
         except NotCopyable as error:
@@ -304,9 +397,14 @@ class Session:
 
     def close(self) -> None:
         """Close the environments."""
-        for stream in filter(None, (self.stream, self._evaluation)):
-            with contextlib.suppress(Exception):
-                stream.envs.close()
+        for envs in (self.stream.envs, None if self._evaluation is None else self._evaluation.envs):
+            if envs is not None:
+                with contextlib.suppress(Exception):
+                    envs.close()
+
+
+def _unheard(line: str) -> None:
+    """Where nobody listens."""
 
 
 def cap_on_evaluation(longest: int, evaluate_every: int, num_episodes: int) -> int:

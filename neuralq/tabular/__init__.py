@@ -19,7 +19,16 @@ from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
-from neuralq.tabular.policies import EpsilonGreedy, KToTheQ, Power, RandomPolicy, Softmax, UpperConfidence, Visits
+from neuralq.tabular.policies import (
+    EpsilonGreedy,
+    KToTheQ,
+    Power,
+    RandomPolicy,
+    SearchThenConverge,
+    Softmax,
+    UpperConfidence,
+    Visits,
+)
 from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
 from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
 from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
@@ -36,6 +45,7 @@ __all__ = [
     "Power",
     "RandomPolicy",
     "RunOptions",
+    "SearchThenConverge",
     "Softmax",
     "Sweeps",
     "UpperConfidence",

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from neuralq.checks import check_fraction
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table
+from neuralq.tabular.kernels.acting import Table
 from neuralq.tabular.kernels.r_learning import run_r_learning
 from neuralq.tabular.kernels.random_numbers import Seed
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.model import Model
-from neuralq.tabular.policies import PolicyLike, StepSizeLike, acting_code, step_code
+from neuralq.tabular.policies import PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Learned
 
-__all__ = ["r_learning"]
+__all__ = ["r_learner", "r_learning"]
 
 
 def r_learning(
@@ -48,14 +49,27 @@ def r_learning(
     table, ready = new_table(source, options)
     if isinstance(ready, Model) and ready.arrays.ends.any():
         raise ValueError("R-learning is for worlds that go on for ever, but episodes of this model end; use q_learning")
-    acting, gain = acting_code(policy), np.zeros(2)
-    arguments = (step_code(step_size, num_steps), gain, float(beta))
-    check_fraction("beta", beta)
+    learner = r_learner(table, policy, step_code(step_size, num_steps), beta)
+    learned = learn(learner, ready, num_steps, 1.0, seed, options)
+    return replace(learned, average_reward=float(learner.arguments[1][0]))
 
-    def run(*given: Any) -> None:
-        run_r_learning(*given)
+
+def r_learner(table: Table, policy: PolicyLike, step_size: StepCode, beta: float) -> Learner:
+    """What `r_learning` runs; the gain ρ is the first entry of its second argument.
+
+    Raises:
+        ValueError: an argument out of range.
+
+    Example:
+        >>> from neuralq.tabular.engine import table_from
+        >>> r_learner(table_from([[0.0]]), "greedy", step_code(0.1, 1), 0.01).arguments[1].tolist()
+        [0.0, 0.0]
+    """
+    check_fraction("beta", beta)
+    gain = np.zeros(2)
+
+    def check() -> None:
         if gain[1]:
             raise ValueError("R-learning is for worlds that go on for ever, but an episode of this one ended")
 
-    learned = learn(Learner(run, table, acting, arguments), ready, num_steps, 1.0, seed, options)
-    return replace(learned, average_reward=float(gain[0]))
+    return Learner(run_r_learning, table, acting_code(policy), (step_size, gain, float(beta)), check=check)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table, replay, table_from
-from neuralq.tabular.kernels.acting import FORGET, SARSA, Log, Table, Walk
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.kernels.acting import SARSA, Table
 from neuralq.tabular.kernels.one_step import RULES, run_one_step
 from neuralq.tabular.kernels.q_learning import run_q_learning
 from neuralq.tabular.kernels.random_numbers import Seed
-from neuralq.tabular.model import ModelArrays
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.policies import (
     EPSILON_GREEDY,
     RANDOM,
-    ActingCode,
     PolicyLike,
     StepCode,
     StepSizeLike,
@@ -27,7 +24,7 @@ from neuralq.tabular.policies import (
 )
 from neuralq.tabular.results import Experience, Learned
 
-__all__ = ["apply", "double_q", "expected_sarsa", "q_learning", "sarsa"]
+__all__ = ["apply", "double_q", "expected_sarsa", "one_step_learner", "q_learning", "sarsa"]
 
 
 def q_learning(
@@ -170,7 +167,9 @@ def apply(
         [[0.0], [100.0]]
     """
     check_choice("rule", rule, RULES)
-    return replay(_learner(rule, table_from(q), policy, step_size, len(experience)), experience, seed)
+    return replay(
+        one_step_learner(rule, table_from(q), policy, step_code(step_size, len(experience))), experience, seed
+    )
 
 
 def _learn(
@@ -184,23 +183,26 @@ def _learn(
     options: RunOptions,
 ) -> Learned:
     table, ready = new_table(source, options)
-    return learn(_learner(rule, table, policy, step_size, num_steps), ready, num_steps, gamma, seed, options)
+    return learn(
+        one_step_learner(rule, table, policy, step_code(step_size, num_steps)), ready, num_steps, gamma, seed, options
+    )
 
 
-def _learner(rule: str, table: Table, policy: PolicyLike, step_size: StepSizeLike, num_steps: int) -> Learner:
+def one_step_learner(rule: str, table: Table, policy: PolicyLike, step_size: StepCode) -> Learner:
+    """What the one-step learners run, by the rule: "q-learning", "sarsa", "expected-sarsa" or "double-q".
+
+    Raises:
+        ValueError: expected Sarsa for a policy that is no distribution.
+
+    Example:
+        >>> one_step_learner("sarsa", table_from([[0.0, 0.0]]), "greedy", step_code(1.0, 1)).on_policy
+        True
+    """
     acting = acting_code(policy)
     check_expectation(rule, acting)
     halves = np.stack([table.q, table.q]) if rule == "double-q" else np.zeros((0, 0, 0))
-    arguments = (step_code(step_size, num_steps), RULES.index(rule), halves)
     plain = rule == "q-learning" and acting.kind in (EPSILON_GREEDY, RANDOM)
-    return Learner(_q_learning if plain else run_one_step, table, acting, arguments, rule == RULES[SARSA])
-
-
-def _q_learning(
-    model: ModelArrays, policy: ActingCode, table: Table, walk: Walk, log: Log, step_size: StepCode, *rest: Any
-) -> None:
-    """The general loop, or the fast one where nothing is recorded, replayed or hidden."""
-    if log.mode == FORGET and model.observe.size == 0:
-        run_q_learning(model, policy, table, walk, step_size, *rest[-2:])
-    else:
-        run_one_step(model, policy, table, walk, log, step_size, *rest)
+    return Learner(
+        run_one_step, table, acting, (step_size, RULES.index(rule), halves), rule == RULES[SARSA],
+        fast=run_q_learning if plain else None, copies=(halves,) if rule == "double-q" else (),
+    )  # fmt: skip

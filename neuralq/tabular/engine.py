@@ -18,28 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_discount, check_whole
 from neuralq.mdp import FiniteMDP
-from neuralq.tabular.kernels.acting import (
-    ACTION,
-    EPISODE_STEPS,
-    EPISODES,
-    FORGET,
-    RECORD,
-    REPLAY,
-    STATE,
-    STEP,
-    Log,
-    Table,
-    Walk,
-    choose,
-    new_log,
-    new_walk,
-)
+from neuralq.tabular.kernels.acting import EPISODES, FORGET, RECORD, REPLAY, Log, Table, Walk, new_log, new_walk
 from neuralq.tabular.kernels.random_numbers import Seed
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.model import RESTARTS, Model, ModelArrays, compile_model, empty_arrays
-from neuralq.tabular.policies import ActingCode
 from neuralq.tabular.results import Curve, Experience, Learned, masked
+from neuralq.tabular.walking import EnvironmentWalk, WalkFault, state_reader
 
-__all__ = ["Learner", "RunOptions", "learn", "log_of", "new_table", "replay", "table_from"]
+__all__ = ["RunOptions", "learn", "log_of", "new_table", "replay", "table_from"]
 
 Source = FiniteMDP | Model | gymnasium.Env[Any, Any]
 """What can be learned on: a model, the same compiled once for many runs, or an environment with finite spaces."""
@@ -82,31 +68,6 @@ class RunOptions:
             check_whole("change step", self.change[0])
         if self.exact_q is not None and self.record_every is None:
             raise ValueError("exact_q is used for the curve; set record_every too")
-
-
-@dataclass(frozen=True)
-class Learner:
-    """A loop and what it changes: the whole of a tabular learner.
-
-    Args:
-        loop: of `neuralq.tabular.kernels`.
-        table: what is learned.
-        policy: how to act.
-        arguments: of the loop, from the step size to γ.
-        on_policy: whether the next action is chosen before the update.
-        backups: where all updates are counted, if they are not one for each transition.
-    """
-
-    loop: Callable[..., None]
-    table: Table
-    policy: ActingCode
-    arguments: tuple[Any, ...]
-    on_policy: bool = False
-    backups: NDArray[np.int64] | None = None
-
-    def run(self, model: ModelArrays, walk: Walk, log: Log, gamma: float, num_steps: int) -> None:
-        """Consume ``num_steps`` transitions, from the model or from the log."""
-        self.loop(model, self.policy, self.table, walk, log, *self.arguments, gamma, num_steps)
 
 
 def new_table(source: Source, options: RunOptions) -> tuple[Table, Source]:
@@ -180,9 +141,9 @@ def learn(learner: Learner, source: Source, num_steps: int, gamma: float, seed: 
         arrays, world = source.arrays, None
     else:
         assert isinstance(source, gymnasium.Env)
-        arrays, world = empty_arrays(), _World(source, learner, walk, seed)
+        arrays, world = empty_arrays(), EnvironmentWalk(source, _reader(source), learner, walk, _first_seed(seed))
     # Compiled here, so that the clock measures learning.
-    learner.run(arrays, walk, log if world is None else new_log(0, REPLAY), gamma, 0)
+    _learn_some(learner, world, arrays, walk, log, gamma, 0)
     recorder = _Recorder(learner.table.q, options)
     chunk, seconds, taken = options.record_every or num_steps, 0.0, 0
     while taken < num_steps:
@@ -193,15 +154,36 @@ def learn(learner: Learner, source: Source, num_steps: int, gamma: float, seed: 
             elif taken < options.change[0]:
                 count = min(count, options.change[0] - taken)
         began = time.thread_time()
-        if world is None:
-            learner.run(arrays, walk, log._replace(offset=taken), gamma, count)
-        else:
-            world.run(log._replace(offset=taken), gamma, count)
+        _learn_some(learner, world, arrays, walk, log._replace(offset=taken), gamma, count)
         seconds += time.thread_time() - began
         taken += count
         if taken % chunk == 0 or taken == num_steps:
             recorder.note(taken)
     return _result(learner, walk, log, recorder, num_steps, seconds)
+
+
+def _learn_some(
+    learner: Learner, world: EnvironmentWalk | None, arrays: ModelArrays, walk: Walk, log: Log, gamma: float, count: int
+) -> None:
+    """``count`` transitions more, of the model or of the environment."""
+    if world is None:
+        learner.run(arrays, walk, log, gamma, count)
+        return
+    try:
+        world.run(gamma, count, log if log.mode == RECORD else None)
+    except WalkFault as fault:
+        raise fault.__cause__ or ValueError(str(fault)) from None
+
+
+def _reader(env: gymnasium.Env[Any, Any]) -> Callable[[Any], int]:
+    assert isinstance(env.observation_space, Discrete)
+    return state_reader(env.observation_space)
+
+
+def _first_seed(seed: Seed) -> int:
+    """Of the environment: a draw of its own, which is not the policy's stream."""
+    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return int(sequence.generate_state(5)[4] >> 1)
 
 
 def _changed(source: Source, options: RunOptions) -> Model | None:
@@ -297,59 +279,3 @@ class _Recorder:
             return None
         steps, *rest = np.array(self._rows, dtype=np.float64).T
         return Curve(steps.astype(np.int64), *rest)
-
-
-class _World:
-    """A Gymnasium environment walked by a learner, one transition per kernel call."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any], learner: Learner, walk: Walk, seed: Seed) -> None:
-        self._env, self._learner, self._walk = env, learner, walk
-        self._first = int(env.observation_space.start)  # type: ignore[attr-defined]
-        self._first_action = int(env.action_space.start)  # type: ignore[attr-defined]
-        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-        self._seed: int | None = int(sequence.generate_state(5)[4] >> 1)  # its own draw: not the policy's stream
-        self._limit = int(walk.counters[5])
-        self._seen = np.zeros(learner.table.q.shape[0], dtype=bool)
-        self._row = new_log(1, REPLAY)
-        self._nothing = empty_arrays()
-
-    def run(self, log: Log, gamma: float, num_steps: int) -> None:
-        counters, row = self._walk.counters, self._row
-        for i in range(num_steps):
-            if counters[STATE] < 0:
-                observation, extras = self._env.reset(seed=self._seed)
-                self._seed = None
-                counters[STATE] = int(observation) - self._first
-                self._learn_mask(int(counters[STATE]), extras)
-            s, step = int(counters[STATE]), int(counters[STEP])
-            a = int(counters[ACTION]) if counters[ACTION] >= 0 else self._choose(s, step)
-            observation, reward, terminated, truncated, extras = self._env.step(a + self._first_action)
-            s_t = int(observation) - self._first
-            self._learn_mask(s_t, extras)
-            counters[EPISODE_STEPS] += 1
-            last = terminated or truncated or 0 < self._limit <= counters[EPISODE_STEPS]
-            a_t = self._choose(s_t, step + 1) if self._learner.on_policy and not terminated else -1
-            values = (s, a, float(reward), 0.0 if terminated else gamma, s_t, a_t, last)
-            for column, value in zip(row[2:], values, strict=True):
-                column[0] = value
-            if log.mode == RECORD:
-                for column, value in zip(log[2:], values, strict=True):
-                    column[log.offset + i] = value
-            self._learner.run(self._nothing, self._walk, row, gamma, 1)
-            counters[STATE], counters[ACTION] = (-1, -1) if last else (s_t, a_t)
-            if last:
-                counters[EPISODE_STEPS] = 0
-                counters[EPISODES] += 1
-
-    def _choose(self, s: int, step: int) -> int:
-        return int(choose(self._learner.table, np.uint64(s), step, self._learner.policy, self._walk.rng))
-
-    def _learn_mask(self, s: int, extras: dict[str, Any]) -> None:
-        """The first sight of a state tells which actions it has."""
-        if self._seen[s] or "action_mask" not in extras:
-            return
-        self._seen[s] = True
-        mask = np.asarray(extras["action_mask"], dtype=bool)
-        if mask.any():  # a terminal state may say that it has none: nothing is ever chosen there
-            self._learner.table.q[s, ~mask] = -np.inf
-            self._learner.table.num_legal[s] = int(mask.sum())

@@ -5,10 +5,11 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice, check_whole
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
 from neuralq.tabular.kernels.acting import Table
 from neuralq.tabular.kernels.episodes import BACKUPS, new_store, run_episodes
 from neuralq.tabular.kernels.random_numbers import Seed
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.policies import PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
 

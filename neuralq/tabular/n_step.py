@@ -5,14 +5,15 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice, check_whole
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
 from neuralq.tabular.kernels.acting import BOOTSTRAPS, SARSA, Table
 from neuralq.tabular.kernels.n_step import new_window, run_n_step
 from neuralq.tabular.kernels.random_numbers import Seed
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.policies import PolicyLike, StepCode, StepSizeLike, acting_code, check_expectation, step_code
 from neuralq.tabular.results import Experience, Learned
 
-__all__ = ["apply_n_step", "n_step"]
+__all__ = ["apply_n_step", "n_step", "n_step_learner"]
 
 
 def n_step(
@@ -45,7 +46,7 @@ def n_step(
         [[4.0], [8.0]]
     """
     table, ready = new_table(source, options)
-    learner = _learner(table, policy, step_code(step_size, num_steps), rule, n)
+    learner = n_step_learner(table, policy, step_code(step_size, num_steps), rule, n)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -72,13 +73,23 @@ def apply_n_step(
         >>> apply_n_step([[0.0], [0.0]], steps, n=2, step_size=1.0).q.tolist()
         [[4.0], [8.0]]
     """
-    return replay(_learner(table_from(q), policy, step_code(step_size, len(experience)), rule, n), experience)
+    return replay(n_step_learner(table_from(q), policy, step_code(step_size, len(experience)), rule, n), experience)
 
 
-def _learner(table: Table, policy: PolicyLike, step_size: StepCode, rule: str, n: int) -> Learner:
+def n_step_learner(table: Table, policy: PolicyLike, step_size: StepCode, rule: str, n: int) -> Learner:
+    """What `n_step` runs.
+
+    Raises:
+        ValueError: an argument out of range.
+
+    Example:
+        >>> n_step_learner(table_from([[0.0]]), "greedy", step_code(1.0, 1), "sarsa", 3).on_policy
+        True
+    """
     acting = acting_code(policy)
     check_choice("rule", rule, BOOTSTRAPS)
     check_whole("n", n)
     check_expectation(rule, acting)
-    arguments = (step_size, new_window(int(n)), BOOTSTRAPS.index(rule))
-    return Learner(run_n_step, table, acting, arguments, rule == BOOTSTRAPS[SARSA])
+    window = new_window(int(n))
+    arguments = (step_size, window, BOOTSTRAPS.index(rule))
+    return Learner(run_n_step, table, acting, arguments, rule == BOOTSTRAPS[SARSA], connections=(window.counters,))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table
 from neuralq.tabular.kernels import dyna, sweeping
 from neuralq.tabular.kernels.acting import Table
 from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.kernels.sweeping import FULL, SAMPLE, Memory, new_memory
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.model import Model
 from neuralq.tabular.policies import PolicyLike, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Learned
@@ -193,12 +193,11 @@ def sweeping_learner(
     if not (math.isfinite(threshold) and threshold >= 0):
         raise ValueError(f"threshold must be a finite number of at least 0, got {threshold}")
 
-    def run(*given: Any) -> None:
-        sweeping.run_sweeping(*given)
+    def check() -> None:
         if memory.counters[sweeping.OVERFLOW]:
             room = memory.times.shape[1]
             raise ValueError(f"a pair had more than max_outcomes={room} different outcomes; raise max_outcomes")
 
     arguments = (step_size, memory, kind, num_planning, float(threshold), bored, float(optimistic))
     backups = memory.counters[sweeping.BACKUPS : sweeping.BACKUPS + 1]
-    return Learner(run, table, acting, arguments, backups=backups)
+    return Learner(sweeping.run_sweeping, table, acting, arguments, backups=backups, check=check)

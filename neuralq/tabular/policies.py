@@ -20,6 +20,7 @@ __all__ = [
     "PolicyLike",
     "Power",
     "RandomPolicy",
+    "SearchThenConverge",
     "Softmax",
     "StepCode",
     "StepSizeLike",
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 EPSILON_GREEDY, K_TO_THE_Q, SOFTMAX, UPPER_CONFIDENCE, RANDOM = range(5)
-CONSTANT, VISITS, POWER, LISTED = range(4)
+CONSTANT, VISITS, POWER, LISTED, SEARCHING = range(5)
 
 TIES = ("random", "lowest")
 
@@ -47,11 +48,12 @@ class ActingCode(NamedTuple):
 
 
 class StepCode(NamedTuple):
-    """A step-size rule as kernels read it."""
+    """A step-size rule as kernels read it; ``scale`` is the number of visits after which `SearchThenConverge` turns."""
 
     kind: int
     value: float
     listed: NDArray[np.float64]
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -228,9 +230,29 @@ class Power:
         check_positive("omega", self.omega)
 
 
-StepSizeLike = float | str | Visits | Power | Sequence[float] | NDArray[np.float64] | Callable[[int], float]
-"""A number; ``"visits"``, ``"one-over-n"`` or ``"deterministic"`` (α = 1); `Power`; the α of the first, second, …
-visit of a pair (the last one stays); or a function of the visit count n = 1, 2, …"""
+@dataclass(frozen=True)
+class SearchThenConverge:
+    """α_n = α / (1 + (n − 1) / τ): near α for the first τ visits of a pair, then as α τ / n (Darken & Moody 1990).
+
+    Args:
+        first: α, of the first visit, above 0 and at most 1.
+        visits: τ, above 0.
+    """
+
+    first: float = 0.5
+    visits: float = 100.0
+
+    def __post_init__(self) -> None:
+        check_positive("first", self.first)
+        check_fraction("first", self.first, "1 is the rule for deterministic worlds")
+        check_positive("visits", self.visits)
+
+
+StepSizeLike = (
+    float | str | Visits | Power | SearchThenConverge | Sequence[float] | NDArray[np.float64] | Callable[[int], float]
+)
+"""A number; ``"visits"``, ``"one-over-n"`` or ``"deterministic"`` (α = 1); `Power`, `SearchThenConverge`; the α of the
+first, second, … visit of a pair (the last one stays); or a function of the visit count n = 1, 2, …"""
 
 _STEP_NAMES = ("visits", "one-over-n", "deterministic")
 _MOST_TABULATED = 1_000_000
@@ -260,6 +282,8 @@ def step_code(step_size: StepSizeLike, num_steps: int) -> StepCode:
         return StepCode(VISITS, 0.0, none)
     if isinstance(step_size, Power):
         return StepCode(POWER, float(step_size.omega), none)
+    if isinstance(step_size, SearchThenConverge):
+        return StepCode(SEARCHING, float(step_size.first), none, float(step_size.visits))
     if callable(step_size):
         listed = np.array([step_size(n) for n in range(1, min(num_steps, _MOST_TABULATED) + 1)], dtype=np.float64)
     elif np.ndim(step_size) == 0:

@@ -11,16 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.mdp import FiniteMDP, Outcomes
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, log_of, new_table, replay, table_from
+from neuralq.tabular.engine import RunOptions, Source, learn, log_of, new_table, replay, table_from
 from neuralq.tabular.kernels.acting import Table, new_walk
 from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.kernels.td import KINDS, UPDATES, run_td
 from neuralq.tabular.kernels.traces import new_traces
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.model import complete_outcomes, empty_arrays
 from neuralq.tabular.policies import CONSTANT, StepCode, StepSizeLike, acting_code, step_code
 from neuralq.tabular.results import Experience, Learned
 
-__all__ = ["batch_td", "predict", "td_lambda", "under_policy"]
+__all__ = ["batch_td", "predict", "td_lambda", "td_learner", "under_policy"]
 
 
 def td_lambda(
@@ -56,7 +57,7 @@ def td_lambda(
     """
     check_choice("update", update, UPDATES[:2])
     table, ready = new_table(source, options)
-    learner = _learner(table, step_code(step_size, num_steps), lambda_, kind, update)
+    learner = td_learner(table, step_code(step_size, num_steps), lambda_, kind, update)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -88,7 +89,7 @@ def predict(
     """
     check_choice("update", update, UPDATES[:2])
     code = step_code(step_size, len(experience))
-    return replay(_learner(table_from(_column(v)), code, lambda_, kind, update), _one_action(experience))
+    return replay(td_learner(table_from(_column(v)), code, lambda_, kind, update), _one_action(experience))
 
 
 def batch_td(
@@ -130,7 +131,7 @@ def batch_td(
     check_whole("max_presentations", max_presentations)
     table, batch, eps = table_from(_column(v)), _one_action(experience), float(np.finfo(np.float64).eps)
     pending = np.zeros(len(table.q))
-    learner = _learner(table, step_code(step_size, 1), lambda_, "accumulating", "batch", pending)
+    learner = td_learner(table, step_code(step_size, 1), lambda_, "accumulating", "batch", pending)
     replay(learner, batch)  # checks the batch; its increments are those of the first presentation
     largest = float(np.max(np.abs(batch.r_t), initial=0.0))
     walk, nothing, log = new_walk(0), empty_arrays(), log_of(batch)
@@ -196,15 +197,29 @@ def _column(v: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(v, dtype=np.float64)[:, None]
 
 
-def _learner(
+def td_learner(
     table: Table,
     step_size: StepCode,
     lambda_: float,
     kind: str,
     update: str,
     pending: NDArray[np.float64] | None = None,
+    acts_in: Table | None = None,
 ) -> Learner:
-    """TD(λ); the increments of a batch are only collected, in ``pending``."""
+    """What `td_lambda` and `predict` run; the increments of a batch are only collected, in ``pending``.
+
+    Args:
+        table: state values ``[S, 1]``.
+        pending: increments not yet added, ``[S]``.
+        acts_in: the actions of the world that is predicted, all equally likely, where it has more than one.
+
+    Raises:
+        ValueError: an argument out of range.
+
+    Example:
+        >>> td_learner(table_from([[0.0]]), step_code(0.1, 1), 0.9, "accumulating", "step").loop is run_td
+        True
+    """
     check_choice("kind", kind, KINDS)
     check_choice("update", update, UPDATES)
     check_fraction("lambda_", lambda_, "for Monte Carlo use lambda_=1")
@@ -216,6 +231,8 @@ def _learner(
         raise ValueError('true online TD(λ) is derived for a constant step size and update="step"')
     size = len(table.q)
     waiting = np.zeros(size) if pending is None else pending
+    traces, v_old = new_traces(size), np.zeros(1)
     rest = (KINDS.index(kind), UPDATES.index(update), float(lambda_))
-    arguments = (step_size, new_traces(size), waiting, np.zeros(1), *rest)
-    return Learner(run_td, table, acting_code("random"), arguments)
+    arguments = (step_size, traces, waiting, v_old, *rest)
+    streams = (*traces, waiting, v_old)
+    return Learner(run_td, table, acting_code("random"), arguments, connections=streams, acts_in=acts_in)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_choice, check_fraction
-from neuralq.tabular.engine import Learner, RunOptions, Source, learn, new_table, replay, table_from
+from neuralq.tabular.engine import RunOptions, Source, learn, new_table, replay, table_from
 from neuralq.tabular.kernels.acting import Table
 from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.kernels.traces import RULES, new_traces, run_traces
+from neuralq.tabular.learner import Learner
 from neuralq.tabular.policies import PolicyLike, StepCode, StepSizeLike, acting_code, check_expectation, step_code
 from neuralq.tabular.results import Experience, Learned
 
-__all__ = ["apply_lambda", "q_lambda", "sarsa_lambda"]
+__all__ = ["apply_lambda", "q_lambda", "sarsa_lambda", "trace_learner"]
 
 
 def q_lambda(
@@ -50,7 +51,7 @@ def q_lambda(
     """
     check_choice("rule", rule, RULES[:3])
     table, ready = new_table(source, options)
-    learner = _learner(table, policy, step_code(step_size, num_steps), rule, lambda_, trace)
+    learner = trace_learner(table, policy, step_code(step_size, num_steps), rule, lambda_, trace)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -87,7 +88,7 @@ def sarsa_lambda(
     """
     rule = "expected-sarsa" if expected else "sarsa"
     table, ready = new_table(source, options)
-    learner = _learner(table, policy, step_code(step_size, num_steps), rule, lambda_, trace)
+    learner = trace_learner(table, policy, step_code(step_size, num_steps), rule, lambda_, trace)
     return learn(learner, ready, num_steps, gamma, seed, options)
 
 
@@ -117,14 +118,26 @@ def apply_lambda(
         [[4.0], [8.0]]
     """
     code = step_code(step_size, len(experience))
-    return replay(_learner(table_from(q), policy, code, rule, lambda_, trace), experience)
+    return replay(trace_learner(table_from(q), policy, code, rule, lambda_, trace), experience)
 
 
-def _learner(table: Table, policy: PolicyLike, step_size: StepCode, rule: str, lambda_: float, trace: str) -> Learner:
+def trace_learner(
+    table: Table, policy: PolicyLike, step_size: StepCode, rule: str, lambda_: float, trace: str
+) -> Learner:
+    """What `q_lambda` and `sarsa_lambda` run.
+
+    Raises:
+        ValueError: an argument out of range.
+
+    Example:
+        >>> trace_learner(table_from([[0.0]]), "greedy", step_code(1.0, 1), "peng", 0.9, "replacing").on_policy
+        False
+    """
     acting = acting_code(policy)
     check_choice("rule", rule, RULES)
     check_fraction("lambda_", lambda_, "for Monte Carlo use lambda_=1")
     check_choice("trace", trace, ("accumulating", "replacing"))
     check_expectation(rule, acting)
-    arguments = (step_size, new_traces(table.q.size), RULES.index(rule), trace == "replacing", float(lambda_))
-    return Learner(run_traces, table, acting, arguments, rule == "sarsa")
+    traces = new_traces(table.q.size)
+    arguments = (step_size, traces, RULES.index(rule), trace == "replacing", float(lambda_))
+    return Learner(run_traces, table, acting, arguments, rule == "sarsa", connections=traces)

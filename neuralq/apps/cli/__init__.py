@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
+from neuralq.apps.cli.numbers import joined, number, whole_number
 from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
 from neuralq.checks import ELSEWHERE
 
@@ -57,7 +58,7 @@ COMMANDS = {
     "evaluate": _of("runs", "evaluate", "play greedy episodes with a trained run", _LOOK),
     "report": _of("runs", "report", "write a run's report.html", _LOOK),
     "compare": _of("compare", "compare", "table and plot of several runs or sweeps side by side", _LOOK),
-    "presets": _of("presets", "presets", "list the tuned settings per environment", _LOOK),
+    "presets": _of("presets", "presets", "an overview of tuned settings, or one of them whole", _LOOK),
     "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),
     "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
     "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),
@@ -120,13 +121,21 @@ _asking = contextvars.ContextVar("_asking", default=False)
 
 
 class CommandParser(argparse.ArgumentParser):
-    """The parser of a command: options have hyphens, and λ is ``--lambda``, whichever way they are typed."""
+    """The parser of a command: options have hyphens, and λ is ``--lambda``, whichever way they are typed.
+
+    Numbers are read as people write them (`neuralq.apps.cli.numbers`) wherever an option's type is int or float.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.register("type", int, whole_number)
+        self.register("type", float, number)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; the parser itself is handed out where a command was asked for it."""
         if _asking.get() and self.add_help:  # one without help only looks ahead
             raise _Asked(self)
-        return super().parse_known_args([option_as_typed(token) for token in args or ()], namespace)
+        return super().parse_known_args(joined(option_as_typed(token) for token in args or ()), namespace)
 
 
 def option_as_typed(token: str) -> str:
@@ -244,7 +253,7 @@ def _main(argv: Sequence[str] | None) -> int:
         print(f"neuralq: {ELSEWHERE}", file=sys.stderr)
         return 1
     module, function = COMMANDS[arguments[0]][:2]
-    asks = bool({"-h", "--help", "--print_config", "--print-config"} & set(arguments))  # and prints what it is told
+    asks = bool({"-h", "--help", "--print-config", "--print_config"} & set(arguments))  # and prints what it is told
     try:
         with _present_folder(), warnings.catch_warnings(), _own_output("--json" in arguments and not asks):
             command: Callable[[list[str]], int] = getattr(importlib.import_module(module), function)

@@ -32,7 +32,7 @@ def chapter(argv: list[str]) -> int:
         "neuralq chapter fig-13.2 --svg grid.svg",
     )
     parser.add_argument("page", nargs="?", choices=tuple(PAGES), metavar="PAGE", help="which page to run")
-    parser.add_argument("--svg", metavar="PATH", help="also write the page's drawings to this SVG file")
+    parser.add_argument("--svg", metavar="FILE", help="also write the page's drawings to this SVG file")
     options = parser.parse_args(argv)
     if options.page is None:
         if options.svg is not None:

@@ -71,9 +71,10 @@ def _add_train(to: argparse.ArgumentParser) -> None:
 def _environments() -> list[str]:
     """Environments that have a preset, and neuralq's own."""
     from neuralq.runs.recipe.presets import PRESETS
+    from neuralq.runs.recipe.replay_presets import ANY
     from neuralq_envs import ENVIRONMENTS
 
-    return [*dict.fromkeys(env for env, _ in PRESETS), *ENVIRONMENTS]
+    return [*dict.fromkeys(env for env, _ in PRESETS if env != ANY), *ENVIRONMENTS]
 
 
 def _copy(parser: argparse.ArgumentParser, to: argparse.ArgumentParser) -> None:
@@ -99,4 +100,4 @@ def _copy(parser: argparse.ArgumentParser, to: argparse.ArgumentParser) -> None:
 
 
 def _typed(name: str) -> str:
-    return name if name == "--print_config" else name.rstrip("_").replace("_", "-")
+    return name.rstrip("_").replace("_", "-")

@@ -36,10 +36,12 @@ def demo(argv: list[str]) -> int:
         "Learn CartPole-v1 by TD(λ), predict and measure divergence on Baird's star, write a page on both.",
         "neuralq demo --seed 1",
     )
-    parser.add_argument("--folder", default="runs/demo", help="where the results go (default: runs/demo)")
+    parser.add_argument(
+        "--run-dir", default="runs/demo", metavar="FOLDER", help="where the results go (default: runs/demo)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the training run (default: 0)")
     options = parser.parse_args(argv)
-    folder = Path(options.folder)
+    folder = Path(options.run_dir)
     began = time.perf_counter()
     console = Console(file=sys.stderr)
     run = _cartpole(folder / "cartpole", options.seed, console)

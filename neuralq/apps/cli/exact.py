@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
-import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.apps.pages.grids import short
 from neuralq.apps.pages.page import Arrow, ChapterPage, GridDrawing, Square
 from neuralq.apps.pages.svg import page_svg
@@ -19,15 +17,12 @@ from neuralq.apps.pages.text import ARROWS, drawing_lines
 from neuralq.exact import METHODS, Solution, count_optimal_policies
 from neuralq.exact import solve as solve_mdp
 from neuralq.mdp import FiniteMDP
+from neuralq.mdp.grid import GridPlan, grid_plan
 from neuralq.runs.recipe.games import make_single, refusals_name
 
 __all__ = ["solve"]
 
 _MOST_ROWS = 64
-_MOST_COLUMNS = 16
-_COMPASS = ("north", "east", "south", "west")
-# Moves of Gymnasium's own grids, in the order of their action numbers: left, down, right, up, and clockwise from up.
-_FROZEN_LAKE, _CLIFF_WALKING = (3, 2, 1, 0), (0, 1, 2, 3)
 
 
 def solve(argv: list[str]) -> int:
@@ -37,7 +32,7 @@ def solve(argv: list[str]) -> int:
     solution = solve_mdp(mdp, options.gamma, options.method, options.tol, max_iterations=options.max_iterations)
     grid, lines = None, _table(mdp, solution)
     if layout is not None:
-        grid = layout.drawn(mdp, solution)
+        grid = _drawn(layout, mdp, solution)
         lines = [*drawing_lines(grid), _legend(layout)]
     if options.svg is not None:
         if grid is None:
@@ -91,15 +86,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--max-iterations", type=int, metavar="N", help="stop after so many (default: when it is solved)"
     )
-    parser.add_argument(
-        "--env-kwargs", type=_json_object, default={}, metavar="JSON", help="JSON object passed to gymnasium.make"
-    )
+    parser.add_argument("--env-kwargs", type=reader(dict), default={}, metavar="MAPPING", help=ENV_KWARGS)
     parser.add_argument(
         "--no-check",
         action="store_true",
         help="take the table as it stands; else a few thousand steps of the environment are compared with it first",
     )
-    parser.add_argument("--svg", metavar="PATH", help="also draw the grid to this SVG file")
+    parser.add_argument("--svg", metavar="FILE", help="also draw the grid to this SVG file")
     return parser
 
 
@@ -108,84 +101,34 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _json_object(text: str) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise argparse.ArgumentTypeError(f"must be a JSON object such as '{{\"is_slippery\": false}}', got {text!r}")
-    return value
-
-
-def _model(env_id: str, kwargs: dict[str, Any], *, check: bool) -> tuple[FiniteMDP, _Layout | None, int | None]:
+def _model(env_id: str, kwargs: dict[str, Any], *, check: bool) -> tuple[FiniteMDP, GridPlan | None, int | None]:
     with refusals_name(env_id):
         env = make_single(env_id, kwargs)
     try:
         mdp = FiniteMDP.from_gymnasium(env, check=check)
-        return mdp, _layout(env.unwrapped, mdp), None if env.spec is None else env.spec.max_episode_steps
+        return mdp, grid_plan(env.unwrapped, mdp), None if env.spec is None else env.spec.max_episode_steps
     finally:
         env.close()
 
 
-class _Layout(NamedTuple):
-    """Where the states of a grid lie: its width, where each action goes (0 north to 3 west), the sign of each cell."""
-
-    num_columns: int
-    directions: tuple[int, ...]
-    signs: str
-
-    def drawn(self, mdp: FiniteMDP, solution: Solution) -> GridDrawing:
-        """V* with an arrow for every optimal move; walls are cells that nothing leads to and nothing leaves."""
-        entered, largest = _entered(mdp), float(np.abs(solution.v).max())
-        cells = []
-        for s in range(mdp.num_states):
-            if self.signs[s] != " ":
-                cells.append(Square(self.signs[s]))
-            elif mdp.is_terminal[s]:
-                cells.append(Square("end") if entered[s] else Square(wall=True))
-            else:
-                known = np.flatnonzero(solution.optimal_actions[s]) if solution.separated[s] else ()
-                best = sorted(self.directions[a] for a in known)
-                arrows = tuple(map(Arrow, best))
-                v = float(solution.v[s])
-                cells.append(Square(short(v) if largest >= 0.1 else f"{v:.3g}", arrows))
-        return GridDrawing("V* and every optimal move", self.num_columns, tuple(cells))
+def _drawn(plan: GridPlan, mdp: FiniteMDP, solution: Solution) -> GridDrawing:
+    """V* with an arrow for every optimal move."""
+    largest = float(np.abs(solution.v).max())
+    cells = []
+    for s in range(mdp.num_states):
+        if plan.signs[s] != " ":
+            cells.append(Square(plan.signs[s]))
+        elif mdp.is_terminal[s]:
+            cells.append(Square(wall=True) if plan.walls[s] else Square("end"))
+        else:
+            known = np.flatnonzero(solution.optimal_actions[s]) if solution.separated[s] else ()
+            best = sorted(plan.directions[a] for a in known)
+            v = float(solution.v[s])
+            cells.append(Square(short(v) if largest >= 0.1 else f"{v:.3g}", tuple(map(Arrow, best))))
+    return GridDrawing("V* and every optimal move", plan.num_columns, tuple(cells))
 
 
-def _layout(env: Any, mdp: FiniteMDP) -> _Layout | None:
-    """From the names of the states, or from what Gymnasium's own grids say about themselves."""
-    desc, shape = getattr(env, "desc", None), getattr(env, "shape", None)
-    if mdp.state_names is not None:
-        return _named_layout(mdp)
-    if isinstance(desc, np.ndarray) and desc.size == mdp.num_states and mdp.num_actions == 4:
-        signs = "".join(desc.astype(str).reshape(-1).tolist())
-        return _Layout(desc.shape[1], _FROZEN_LAKE, re.sub("[^GH]", " ", signs))
-    if isinstance(shape, tuple) and len(shape) == 2 and np.prod(shape) == mdp.num_states and mdp.num_actions == 4:
-        return _Layout(int(shape[1]), _CLIFF_WALKING, " " * mdp.num_states)
-    return None
-
-
-def _named_layout(mdp: FiniteMDP) -> _Layout | None:
-    """States called "row i, column j", row by row."""
-    found = [re.fullmatch(r"row (\d+), column (\d+)", name) for name in mdp.state_names or ()]
-    places = [(int(match[1]), int(match[2])) for match in found if match is not None]
-    num_columns = 1 + max((column for _, column in places), default=-1)
-    in_order = [(s // num_columns, s % num_columns) for s in range(mdp.num_states)] if num_columns else []
-    names = mdp.action_names or ()
-    if not in_order or places != in_order or num_columns > _MOST_COLUMNS or set(names) != set(_COMPASS):
-        return None
-    return _Layout(num_columns, tuple(map(_COMPASS.index, names)), " " * mdp.num_states)
-
-
-def _entered(mdp: FiniteMDP) -> NDArray[np.bool_]:
-    """States that some move leads to."""
-    entered = np.zeros(mdp.num_states, dtype=bool)
-    entered[mdp.transition.indices if mdp.outcomes is None else mdp.outcomes.s_t] = True
-    return entered
-
-
-def _legend(layout: _Layout) -> str:
+def _legend(layout: GridPlan) -> str:
     return ", ".join(f"{ARROWS[d]} is action {a}" for a, d in enumerate(layout.directions))
 
 

@@ -17,7 +17,7 @@ import torch
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.export_network import ExportedNetwork, input_names, raw_inputs
-from neuralq.apps.cli.sweeps import add_trust, single_run
+from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.checks import MissingExtra
 from neuralq.runs import RunConfig, load
 from neuralq.runs.agent import Agent
@@ -45,7 +45,7 @@ def export(argv: list[str]) -> int:
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--onnx", required=True, metavar="FILE", help="the file to write")
-    parser.add_argument("--best", action="store_true", help="take the best parameters of the run, not the last")
+    add_which(parser)
     add_trust(parser)
     options = parser.parse_args(argv)
     path, out = single_run(options.run, options.trust), Path(options.onnx)

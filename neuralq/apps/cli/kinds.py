@@ -9,16 +9,17 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, get_type_hints
+from types import NoneType
+from typing import Any, get_args, get_type_hints
 
 from neuralq.apps.cli import Failure, print_result
 from neuralq.apps.cli.option_table import add_fields
-from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
+from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options, reader
 from neuralq.apps.cli.progress import training_bar
 from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
 from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named
 
-__all__ = ["conclude", "measured_by", "new_budget", "resume_kind", "say", "train_kind"]
+__all__ = ["changes_of", "conclude", "measured_by", "new_budget", "resume_kind", "say", "train_kind"]
 
 
 def say(line: str) -> None:
@@ -64,11 +65,12 @@ def resume_kind(name: str, options: argparse.Namespace) -> int:
             raise Failure(f"--{other.replace('_', '-')} is not for {kind.title} like {options.run}; leave it out", 2)
     budget, config = new_budget(kind, options), kind.from_plain(read_config(options.run))
     try:
-        config = config if budget is None else kind.changed(config, budget)
+        changes = changes_of(kind, config, options.changes)
+        config = kind.changed(config, budget, changes)
     except ValueError as error:
         raise Failure(_in_options(kind, str(error)), 2) from error
     with training_bar(kind, config) as bar:
-        run = kind.resume(options.run, budget, [bar])
+        run = kind.resume(options.run, budget, [bar], changes)
     return conclude(run, options.json)
 
 
@@ -84,6 +86,31 @@ def new_budget(kind: Kind[Any, Any, Any], options: argparse.Namespace) -> int | 
             raise Failure(f"{option} is not for {kind.title} like {options.run}; leave it out", 2)
     budget: int | None = given[kind.budget]
     return budget
+
+
+def changes_of(kind: Kind[Any, Any, Any], config: Any, words: Sequence[str]) -> dict[str, Any]:
+    """What ``--set key=value`` asks for, by full name, each value of its field's kind.
+
+    Raises:
+        ValueError: for what may not change, with what may.
+        Failure: for words that are no ``key=value``, keys given twice and values of another kind, with exit status 2.
+    """
+    changes: dict[str, Any] = {}
+    for word in words:
+        key, sign, text = word.partition("=")
+        if not sign:
+            raise Failure(f"--set takes key=value, got {word!r}; e.g. --set {kind.budget}=100000", 2)
+        name = kind.full_name(config, key.strip().replace("-", "_"))
+        if name in changes:
+            raise Failure(f"--set {name} is given twice; leave one out", 2)
+        part, dot, field = name.partition(".")
+        owner = type(getattr(config, part)) if dot else type(config)
+        text, hint = text.strip(), get_type_hints(owner)[field if dot else part]
+        try:
+            changes[name] = None if text.lower() == "none" and NoneType in get_args(hint) else reader(hint)(text)
+        except argparse.ArgumentTypeError as error:
+            raise Failure(f"--set {name}: {error}", 2) from error
+    return changes
 
 
 def measured_by(words: Sequence[str]) -> str | None:

@@ -115,7 +115,7 @@ def _parser() -> Parser:
     add("--support", default="grid", choices=tuple(_SUPPORTS), help="where they lie (default: grid, corners included)")
     add("--seed", type=int, default=0, help="of a random support (default: 0)")
     add("--gamma", type=float, default=1.0, help="discount (default: 1)")
-    add("--iterations", type=int, metavar="N", help=f"most sweeps (default: {_RUN}; with a network {_SHORT_RUN})")
+    add("--max-iterations", type=int, metavar="N", help=f"most sweeps (default: {_RUN}; with a network {_SHORT_RUN})")
     _add_numbers(parser)
     return parser
 
@@ -149,8 +149,8 @@ def _check(options: argparse.Namespace, chosen: Sequence[FittedChoice]) -> None:
     check_whole("--seed", options.seed, 0)
     check_discount("--gamma", options.gamma)
     check_positive("--tolerance", options.tolerance)
-    if options.iterations is not None:
-        check_whole("--iterations", options.iterations)
+    if options.max_iterations is not None:
+        check_whole("--max-iterations", options.max_iterations)
     for one in chosen:
         if options.points > one.most_points:
             raise Failure(f"--points must be at most {one.most_points} for {one.name}, got {options.points}")
@@ -206,7 +206,7 @@ def _exact(model: ContinuousModel, support: Floats, gamma: float) -> Floats | No
 
 def _case(setting: _Setting, one: FittedChoice, options: argparse.Namespace) -> _Case:
     regressor = _regressor(setting, one, options)
-    sweeps = options.iterations or (_SHORT_RUN if one.name == "network" else _RUN)
+    sweeps = options.max_iterations or (_SHORT_RUN if one.name == "network" else _RUN)
     found = diagnose_fitted(
         setting.model, setting.support, regressor, gamma=options.gamma, num_iterations=sweeps, start=setting.start,
         exact=setting.exact,
@@ -267,7 +267,7 @@ def _single(case: _Case, options: argparse.Namespace) -> Iterator[RenderableType
     if found.run.stopped_on_cap:
         yield Text("The run was stopped where it had grown ten-billion-fold.", "dim")
     elif not (found.guaranteed or found.run.converged):
-        yield Text(f"Judged from {found.run.iterations} sweeps; more --iterations may show more.", "dim")
+        yield Text(f"Judged from {found.run.iterations} sweeps; more --max-iterations may show more.", "dim")
 
 
 def _reasons(found: FittedDiagnosis) -> Table:

@@ -55,12 +55,12 @@ def matrix(argv: list[str]) -> int:
     problems = _names(options.problem, [entry.name for entry in PROBLEMS], problem)
     methods = _names(options.method, [one.name for one in METHODS], method_named)
     few = len(problems) * len(methods) <= _DETAILED
-    options.jobs = (1 if few else os.cpu_count() or 1) if options.jobs is None else options.jobs
-    for name in ("seeds", "num_steps", "jobs"):
+    options.workers = (1 if few else os.cpu_count() or 1) if options.workers is None else options.workers
+    for name in ("seeds", "num_steps", "workers"):
         check_whole(f"--{name.replace('_', '-')}", getattr(options, name))
     sampled = {name: getattr(options, name) for name in ("sampling", "num_steps", "seed")}
     with _progress(len(problems) * len(methods)) as bar:
-        found = _in_parallel(problems, methods, options.jobs, bar, num_seeds=options.seeds, **sampled)
+        found = _in_parallel(problems, methods, options.workers, bar, num_seeds=options.seeds, **sampled)
     if options.csv is not None:
         found.write_csv(options.csv)
     parts: list[RenderableType] = list(_lines(found.cells)) if options.list or few else list(_grids(found))
@@ -96,7 +96,10 @@ def _parser() -> Parser:
     parser.add_argument("--num-steps", type=int, default=2000, metavar="N", help="updates of each (default: 2000)")
     parser.add_argument("--seed", type=int, default=0, help="of the sampled runs (default: 0)")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes to spread problems on (default: one per core for many cells)"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes to spread problems on (default: one per core for many cells)",
     )
     return parser
 
@@ -109,12 +112,12 @@ def _names(given: list[str] | None, every: list[str], lookup: Callable[[str], ob
     return every if given is None else [name for name in every if name in given]
 
 
-def _in_parallel(problems: list[str], methods: list[str], jobs: int, bar: Bar, **sampled: Any) -> Matrix:
+def _in_parallel(problems: list[str], methods: list[str], workers: int, bar: Bar, **sampled: Any) -> Matrix:
     """The matrix, its rows spread over processes."""
-    if jobs == 1 or len(problems) == 1:
+    if workers == 1 or len(problems) == 1:
         return matrix_of(problems, methods, lambda *at: bar(at), **sampled)
     rows = []
-    with safe_path(), ProcessPoolExecutor(min(jobs, len(problems)), mp_context=get_context("spawn")) as pool:
+    with safe_path(), ProcessPoolExecutor(min(workers, len(problems)), mp_context=get_context("spawn")) as pool:
         waiting = [pool.submit(matrix_of, [name], methods, **sampled) for name in problems]
         for i, one in enumerate(waiting):
             rows.append(one.result())

@@ -15,10 +15,13 @@ import gymnasium as gym
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.film import caption, drawn, frame_rate, make_shown, picture, play, writers_for
 from neuralq.apps.cli.progress import ProgressBar, Told
-from neuralq.apps.cli.sweeps import add_trust, single_run
+from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.control import last_cap
 from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.offline.files import write_recorded
+from neuralq.runs.offline.minari_files import write_minari
+from neuralq.runs.offline.recording import record_steps
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.recipe.games import make_single, refusals_name
 
@@ -61,8 +64,10 @@ def record(argv: list[str]) -> int:
     """Film greedy episodes."""
     parser = command_parser(
         "record",
-        "Film a trained run; needs no display. Step, return and the largest action value stand below the picture.",
+        "Film a trained run; needs no display. Step, return and the largest action value stand below the picture. Or "
+        "record its steps as a data set, to learn from with neuralq train ENV --dataset.",
         "neuralq record RUN --gif run.gif",
+        "neuralq record RUN --to data.npz --episodes 100 --epsilon 0.2",
         "neuralq record RUN --mp4 run.mp4 --episodes 3 --best",
     )
     _add_options(parser, num_episodes=1)
@@ -70,7 +75,20 @@ def record(argv: list[str]) -> int:
     parser.add_argument("--mp4", metavar="FILE", help="write an MP4")
     parser.add_argument("--fps", type=float, metavar="X", help="steps per second (default: what the environment says)")
     parser.add_argument("--width", type=int, default=480, metavar="N", help="of the picture in pixels (default: 480)")
+    parser.add_argument("--to", metavar="FILE.npz", help="record the steps as arrays")
+    parser.add_argument("--minari", metavar="ID", help="record the steps as a data set of Minari's (extra minari)")
+    parser.add_argument(
+        "--epsilon", type=float, metavar="X", help="of recorded steps, the share of random actions (default: 0.1)"
+    )
     options = parser.parse_args(argv)
+    if options.to is not None or options.minari is not None:
+        return _record_steps(options)
+    if options.epsilon is not None:
+        raise Failure("--epsilon is for recorded steps, and a film is greedy; add --to FILE.npz or leave it out", 2)
+    return _record_pictures(options)
+
+
+def _record_pictures(options: argparse.Namespace) -> int:
     if (options.fps is not None and not 0 < options.fps <= 1000) or not 16 <= options.width <= 4096:
         raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
     path = single_run(options.run, options.trust)
@@ -95,12 +113,40 @@ def record(argv: list[str]) -> int:
     return 0
 
 
+def _record_steps(options: argparse.Namespace) -> int:
+    """Steps in place of pictures."""
+    if options.gif or options.mp4 or (options.to and options.minari):
+        raise Failure("one at a time of --gif and --mp4, --to, and --minari", 2)
+    epsilon = 0.1 if options.epsilon is None else options.epsilon
+    if not 0 <= epsilon <= 1 or not str(options.to or ".npz").endswith(".npz"):
+        raise Failure("--epsilon must lie in [0, 1], and --to be a file.npz", 2)
+    path = single_run(options.run, options.trust)
+    config = config_from_dict(read_config(path))
+    agent = load(path, options.best)
+    with refusals_name(config.env):
+        env = make_single(config.env, config.env_kwargs)
+    try:
+        data = record_steps(env, agent, options.episodes, epsilon, options.seed, _limit(options, config))
+        if options.to is not None:
+            write_recorded(options.to, data)
+        else:
+            write_minari(options.minari, data, env, f"neuralq {config.learner}, ε = {epsilon:g}")
+    finally:
+        env.close()
+    name = options.to or f"minari:{options.minari}"
+    counts = {"num_steps": len(data.actions), "num_episodes": data.num_episodes, "epsilon": epsilon}
+    told = f"{name}: {counts['num_steps']:,} steps in {data.num_episodes:,} episodes, ε = {epsilon:g}"
+    plain = {"dataset": name, "run_dir": str(path), "mean_return": data.rewards.sum() / data.num_episodes, **counts}
+    print_result(plain, options.json, [told, f"neuralq train {config.env} --learner replay --dataset {name}"])
+    return 0
+
+
 def _add_options(parser: argparse.ArgumentParser, num_episodes: int) -> None:
     add = parser.add_argument
     add("run", help="run folder")
     add("--episodes", type=int, default=num_episodes, metavar="N", help=f"how many (default: {num_episodes})")
     add("--seed", type=int, default=0, metavar="N", help="of the episodes (default: 0)")
-    add("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    add_which(parser)
     add_trust(parser)
     add("--max-steps", type=int, metavar="N", help="cut an episode after so many (default: as in evaluations)")
 

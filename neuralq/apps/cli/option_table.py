@@ -11,21 +11,22 @@ from types import MappingProxyType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.apps.cli import DEBUG
-from neuralq.apps.cli.option_values import reader
+from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LAYOUTS, LEARNERS
+from neuralq.runs.recipe.replay_presets import AGENTS
 
 __all__ = ["TrainOptions", "add_fields", "train_parser"]
 
 _EXAMPLES = """examples:
   neuralq train CartPole-v1 --seed 3 --stop-at-return 475
   neuralq train CartPole-v1 --seeds 10
-  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50000
-  neuralq train FrozenLake-v1 --layout table --env-kwargs '{"is_slippery": false}'
-  neuralq train td-gammon --games 100000  (backgammon; has options of its own)
+  neuralq train CartPole-v1 --learner replay --layout separate --total-steps 50k
+  neuralq train FrozenLake-v1 --layout table --env-kwargs '{is_slippery: false}'
+  neuralq train td-gammon --games 100k  (backgammon; has options of its own)
   neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
-  neuralq train CartPole-v1 --print_config > run.yaml; neuralq train --config run.yaml --seed 4"""
+  neuralq train CartPole-v1 --print-config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
 _OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
 
@@ -42,7 +43,7 @@ class TrainOptions:
         seeds: how many seeds to run side by side, or None for one run.
         workers: how many of them at a time, or None for as many as there are cores.
         json: whether to print the result as JSON.
-        preset: whether a preset gave defaults.
+        preset: the preset that gave defaults, in words; empty for none.
         notes: what was made of schedules that the budget would not have let finish.
     """
 
@@ -53,7 +54,7 @@ class TrainOptions:
     seeds: int | None
     workers: int | None
     json: bool
-    preset: bool
+    preset: str
     notes: tuple[str, ...]
 
 
@@ -106,7 +107,7 @@ def add_fields(
 
 
 _MORE: tuple[tuple[str, Any, str, str], ...] = (
-    ("env_kwargs", dict, "MAPPING", "JSON or YAML mapping passed to gymnasium.make"),
+    ("env_kwargs", dict, "MAPPING", ENV_KWARGS),
     (
         "body",
         dict | str | None,
@@ -117,9 +118,9 @@ _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ("hidden", str, "N,N", "widths of the hidden layers, e.g. 64,64"),
     ("layer_norm", bool | None, "{true,false}", "layer normalisation in the network"),
     ("activation", str, "NAME", "relu, tanh or leaky_relu"),
-    ("config", str, "FILE", "YAML file of options, as --print_config writes it"),
+    ("config", str, "FILE", "YAML file of options, as --print-config writes it"),
     ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
-    ("preset", bool, "{true,false}", "whether to start from the environment's preset (default: true)"),
+    ("preset", str, "NAME", f"true (the environment's), false, or a whole agent: {', '.join(AGENTS)} (default: true)"),
     ("seeds", int, "N", "run N seeds, counted from --seed, in processes side by side"),
     ("workers", int, "N", "how many seeds at a time (default: as many as there are cores)"),
     ("hook", str, "module:name", "function or class of your own that watches the run (docs/hooks.md); may be repeated"),
@@ -148,7 +149,7 @@ def train_parser(learner: str, preset: dict[str, Any]) -> argparse.ArgumentParse
     parser.add_argument("--env", type=str, help=argparse.SUPPRESS)
     for name, choices, default, text in (
         ("learner", tuple(LEARNERS), RunConfig.learner, "how to learn"),
-        ("layout", LAYOUTS, RunConfig.layout, "how values are represented"),
+        ("layout", LAYOUTS, LEARNERS[learner].layout, "how values are represented"),
     ):
         parser.add_argument(f"--{name}", choices=choices, help=f"{text} (default: {default})")
     add_fields(parser, RunConfig, defaults=preset, leave_out=_OWN_PARSING)

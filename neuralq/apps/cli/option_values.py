@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import NoneType
 from typing import Any, get_args
 
 import yaml  # type: ignore[import-untyped]
 
 from neuralq.apps.cli import Failure
-from neuralq.apps.cli.yaml_text import read_yaml
+from neuralq.apps.cli.numbers import any_number, joined
+from neuralq.apps.cli.yaml_text import read_text
 from neuralq.runs.recipe.config import fitted_value
 
-__all__ = ["as_typed", "hyphenated", "read_config_file", "read_options", "reader"]
+__all__ = ["ENV_KWARGS", "as_typed", "hyphenated", "read_config_file", "read_options", "reader"]
+
+ENV_KWARGS = "YAML or JSON mapping passed to gymnasium.make, as in '{is_slippery: false}'"
 
 
 def hyphenated(argv: Sequence[str]) -> list[str]:
@@ -44,33 +47,40 @@ def as_typed(text: str) -> str:
         >>> as_typed("--lambda_ and --step_size")
         '--lambda and --step-size'
     """
-    return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text).replace(
-        "--print-config", "--print_config"
-    )
+    return re.sub(r"--[a-z_.]+", lambda m: m[0].rstrip("_").replace("_", "-"), text)
 
 
 def reader(hint: Any) -> Callable[[str], Any]:
     """What reads an option's text as the kind of value that its field holds."""
 
     def read(text: str) -> Any:
-        value: Any = text
-        if hint is not str:
-            try:
-                value = read_yaml(text)
-            except yaml.YAMLError:
-                pass  # a word that is no YAML is what it is
-            except ValueError as error:
-                raise argparse.ArgumentTypeError(f"cannot be read: {error}") from error
-            with contextlib.suppress(ValueError):  # YAML 1.1 takes 1e-5 for a word
-                value = float(text) if isinstance(value, str) else value
         try:
-            return fitted_value("", value, hint, text)
+            return fitted_value("", _value(text, hint), hint, text)
         except ValueError as error:
             if str in get_args(hint):
                 return text
             raise argparse.ArgumentTypeError(str(error)) from error
 
     return read
+
+
+def _value(text: str, hint: Any) -> Any:
+    """The text as a number where one is wanted, else as YAML; what is neither is what it is."""
+    kinds = {hint, *get_args(hint)}
+    if kinds & {int, float}:
+        if NoneType in kinds and text.lower() in ("none", "null", "~", ""):
+            return None
+        with contextlib.suppress(ValueError):
+            return any_number(text)
+        return text
+    if hint is str:
+        return text
+    try:
+        return read_text(text)
+    except yaml.YAMLError:
+        return text
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"cannot be read: {error}") from error
 
 
 def read_options(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[str, Any]:
@@ -81,7 +91,7 @@ def read_options(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[s
     """
     hint = f"; `{parser.prog} --help` lists the options"
     try:
-        found, unknown = parser.parse_known_args(list(argv))
+        found, unknown = parser.parse_known_args(joined(argv))
     except argparse.ArgumentError as error:
         said, name = " ".join(error.message.split()), error.argument_name
         if name is not None:
@@ -103,20 +113,10 @@ def read_config_file(path: str) -> dict[str, Any]:
         Failure: if it cannot be read or holds something else, with exit status 2.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        try:
-            content = json.loads(text, object_pairs_hook=_once)  # YAML 1.1 takes 1e-05 for a word
-        except (ValueError, RecursionError):
-            content = read_yaml(text)
+        content = read_text(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise Failure(f"cannot read --config {path}: {' '.join(str(error).split())}", 2) from error
     content = {} if content is None else content
     if not isinstance(content, dict):
         raise Failure(f"--config {path} must hold a mapping of options, got {type(content).__name__}", 2)
     return content
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(found := dict(pairs)) < len(pairs):
-        raise ValueError("a key is given twice")
-    return found

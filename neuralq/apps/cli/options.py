@@ -11,15 +11,16 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
-
 from neuralq.apps.cli import Failure
 from neuralq.apps.cli.option_table import TrainOptions, train_parser
 from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
+from neuralq.apps.cli.yaml_text import write_yaml
 from neuralq.q.bodies import NAMED_BODIES
-from neuralq.runs import RunConfig, preset_for
+from neuralq.runs import RunConfig
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LEARNERS, NETWORKS, body_to_dict, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, body_to_dict, config_from_dict, config_to_dict
+from neuralq.runs.recipe.presets import started, under, yielding
+from neuralq.runs.recipe.replay_presets import AGENTS
 
 __all__ = ["parse_train"]
 
@@ -55,7 +56,12 @@ def _peek(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any], list
     except argparse.ArgumentError as error:
         raise Failure(f"{error}; `neuralq train --help` lists the options", 2) from error
     file = {} if known.config is None else _read_file(known.config)
-    for name, default in (("env", ""), ("learner", RunConfig.learner), ("layout", RunConfig.layout)):
+    agent = AGENTS.get(str(known.preset).lower(), {})
+    for name, default in (
+        ("env", ""),
+        ("learner", agent.get("learner", RunConfig.learner)),
+        ("layout", RunConfig.layout),
+    ):
         setattr(known, name, getattr(known, name) or file.get(name) or default)
     if str(known.learner) not in LEARNERS:  # refused with the right words later
         known.learner = RunConfig.learner
@@ -93,10 +99,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     """
     argv = _with_env_named(hyphenated(argv))
     known, file, rest = _peek(argv)
-    preset = preset_for(str(known.env), known.learner) if str(known.preset).lower() not in ("false", "no", "0") else {}
-    if known.layout not in NETWORKS:  # a preset's body is for networks
-        preset = {name: value for name, value in preset.items() if name != "body"}
-    has_preset = bool(preset)
+    preset, origin = _preset(known)
     if {"-h", "--help"} & set(rest):
         print(as_typed(train_parser(known.learner, preset).format_help()))
         return None
@@ -113,7 +116,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         seeds=given.pop("seeds", None),
         workers=given.pop("workers", None),
         json=given.pop("json", False),
-        preset=has_preset,
+        preset=origin,
         notes=tuple(notes),
     )
     _check_counts(options)
@@ -124,9 +127,22 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     except ValueError as error:
         raise Failure(str(error), 2) from error
     if printed:
-        print(yaml.safe_dump(json.loads(json.dumps(config_to_dict(config))), sort_keys=False), end="")
+        print(write_yaml(json.loads(json.dumps(config_to_dict(config)))), end="")
         return None
     return config, options
+
+
+def _preset(known: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    """The preset that was asked for, or that the environment has, and what it is called."""
+    asked = str(known.preset).lower()
+    if asked in ("false", "no", "0"):
+        return {}, ""
+    name = None if asked in ("none", "true", "yes", "1") else asked
+    try:
+        _, preset = under({"env": known.env, "learner": known.learner, "layout": str(known.layout)}, name)
+    except ValueError as error:
+        raise Failure(f"--preset is true, false or the name of an agent: {error}", 2) from error
+    return preset, started(str(known.env), known.learner, name) if preset else ""
 
 
 def _check_counts(options: TrainOptions) -> None:
@@ -150,7 +166,9 @@ def _merged(learner: str, preset: dict[str, Any], file: dict[str, Any], given: d
     for layer in layers:
         if not isinstance(layer, dict):
             raise Failure(f"{learner} must be a mapping, got {layer!r}", 2)
-    values[learner] = {name: value for layer in layers for name, value in layer.items()}
+    own, *others = layers
+    given_settings = {name: value for layer in others for name, value in layer.items()}
+    values[learner] = {**yielding(own, given_settings), **given_settings}
     if "hidden" in short:
         try:
             short["hidden"] = [int(width) for width in re.split(r"[,\s]+", short["hidden"].strip("[] "))]

@@ -8,25 +8,30 @@ import functools
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.kinds import conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
-from neuralq.apps.cli.sweeps import add_trust, resume_seeds, single_run, started_from, train_seeds
+from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
-from neuralq.runs import Run, RunConfig, evaluate_run
-from neuralq.runs.control import CONTROL, last_cap
+from neuralq.runs import Run, RunConfig, evaluate_run, load
+from neuralq.runs.changes import told
+from neuralq.runs.control import CONTROL, agent_of, last_cap
+from neuralq.runs.estimate import estimate_policy
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import claimed, read_config, read_metrics, refuse_old_run
+from neuralq.runs.folder.run_folder import claimed, read_changes, read_config, read_metrics, refuse_old_run
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
+from neuralq.runs.offline.files import read_recorded
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.report import write_report
-from neuralq.runs.sweep import is_sweep_folder
+from neuralq.runs.sweep import is_sweep_folder, open_sweep
 
 __all__ = ["evaluate", "report", "resume", "train"]
 
@@ -53,6 +58,26 @@ def train(argv: list[str]) -> int:
 
 def resume(argv: list[str]) -> int:
     """Go on with a run."""
+    options = _resume_parser().parse_args(argv)
+    kind = kind_in(options.run)
+    if kind not in (None, "control"):
+        return resume_kind(kind, options)
+    total_steps, changes = _asked_of(options)
+    if is_sweep_folder(options.run):
+        if options.hook is not None:
+            raise Failure("a sweep goes on with the hooks that it was begun with; leave --hook out", 2)
+        return resume_seeds(options.run, total_steps, options.workers, options.json, changes, options.trust)
+    if options.workers is not None:
+        raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
+    path = single_run(options.run, options.trust)
+    planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
+    board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
+    with _hooks(path, planned, board, tracker, options.hook or ()) as hooks:
+        run = CONTROL.resume(path, total_steps, hooks, changes)
+    return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
+
+
+def _resume_parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "resume",
         "Go on with a run from its newest intact checkpoint, or with a sweep of seeds where each of them stands.",
@@ -72,25 +97,25 @@ def resume(argv: list[str]) -> int:
     parser.add_argument(
         "--hook", action="append", metavar="module:name", help="of a run on an environment: as for neuralq train"
     )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="key=value", dest="changes",
+        help="go on with another value, may be repeated: budget, target, step size, evaluations, checkpoints, device",
+    )  # fmt: skip
     add_trust(parser)
-    options = parser.parse_args(argv)
-    kind = kind_in(options.run)
-    if kind not in (None, "control"):
-        return resume_kind(kind, options)
+    return parser
+
+
+def _asked_of(options: argparse.Namespace) -> tuple[int | None, dict[str, Any]]:
+    """The new budget and the other changes that ``neuralq resume`` was given, by whichever option."""
     total_steps = new_budget(CONTROL, options)
     changes = {name: getattr(options, name) for name in ("stop_at_return", "device") if hasattr(options, name)}
-    if is_sweep_folder(options.run):
-        if options.hook is not None:
-            raise Failure("a sweep goes on with the hooks that it was begun with; leave --hook out", 2)
-        return resume_seeds(options.run, total_steps, options.workers, options.json, changes, options.trust)
-    if options.workers is not None:
-        raise Failure(f"--workers is for a sweep, and {options.run} is none; leave it out", 2)
-    path = single_run(options.run, options.trust)
-    planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
-    board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
-    with _hooks(path, planned, board, tracker, options.hook or ()) as hooks:
-        run = CONTROL.resume(path, total_steps, hooks, changes)
-    return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
+    if not options.changes:
+        return total_steps, changes
+    stored = open_sweep(options.run).config if is_sweep_folder(options.run) else read_config(options.run)
+    asked = changes_of(CONTROL, config_from_dict(stored), options.changes)
+    if twice := {*changes, *([] if total_steps is None else ["total_steps"])} & set(asked):
+        raise Failure(f"{min(twice)} is given twice, with --set and by its own option; leave one out", 2)
+    return asked.pop("total_steps", total_steps), {**changes, **asked}
 
 
 def target(text: str) -> float | None:
@@ -100,7 +125,7 @@ def target(text: str) -> float | None:
         >>> target("475"), target("none")
         (475.0, None)
     """
-    return None if text.lower() in ("none", "null") else float(text)
+    return None if text.lower() in ("none", "null") else number(text)
 
 
 @contextlib.contextmanager
@@ -130,7 +155,7 @@ def _end(close: Callable[[], object], hook: Hook) -> None:
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play greedy episodes with a run's newest checkpoint, or its best; or a match of backgammon."""
+    """Play greedy episodes with a run's agent, its last parameters or its best; or a match of backgammon."""
     measure = measured_by(argv)
     if measure is not None:
         module, _, function = measure.partition(":")
@@ -138,19 +163,37 @@ def evaluate(argv: list[str]) -> int:
         return status
     parser = command_parser(
         "evaluate",
-        "Play greedy episodes with a trained run. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
+        "Play greedy episodes with the agent of a run: its last parameters, or its best where the run ended well below "
+        "them, which it says. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
         "neuralq evaluate RUN --episodes 100",
+        "neuralq evaluate RUN --on data.npz",
         "neuralq evaluate RUN --against gnubg --games 5000",
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    parser.add_argument("--best", action="store_true", help="play with the best parameters of the run, not the last")
+    parser.add_argument(
+        "--on", metavar="DATA", help="play nothing: estimate the value from recorded steps, minari:ID or a file.npz"
+    )
+    add_which(parser)
     add_trust(parser)
     options = parser.parse_args(argv)
-    result = evaluate_run(single_run(options.run, options.trust), options.episodes, options.seed, options.best)
-    named = {"run_dir": str(options.run), "parameters": "best" if options.best else "newest"}
-    print_result({**result.plain(), **named}, options.json, result.lines())
+    path = single_run(options.run, options.trust)
+    if options.on is not None:
+        return _estimate(path, options)
+    result = evaluate_run(path, options.episodes, options.seed, options.best)
+    which = agent_of(path) if options.best is None else "best" if options.best else "final"
+    named = {"run_dir": str(options.run), "parameters": which}
+    played = f"played with the {which} parameters" + (", the agent of the run" if options.best is None else "")
+    print_result({**result.plain(), **named}, options.json, [*result.lines(), played])
+    return 0
+
+
+def _estimate(path: Path, options: argparse.Namespace) -> int:
+    """The value of the greedy policy by experience of others."""
+    agent, config = load(path, options.best), config_from_dict(read_config(path))
+    found = estimate_policy(agent, config, read_recorded(options.on), options.seed)
+    print_result({**found.plain(), "run_dir": str(path), "dataset": options.on}, options.json, found.lines())
     return 0
 
 
@@ -175,10 +218,11 @@ def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> in
         say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")
     best = _best_return(run)
     notes = []
-    if best is not None and run.greedy_return is not None and best > run.greedy_return:
+    if run.play_off is None and best is not None and run.greedy_return is not None and best > run.greedy_return:
         notes.append(f"the best evaluation scored {shown(best)}: neuralq evaluate {run.run_dir} --best")
     if (cut := _cut(run)) is not None:
         notes.append(cut)
+    notes += [told(row) for row in read_changes(run.run_dir)]
     status = conclude(run, as_json, notes, best_return=best, report=report_path)
     if status == 0 and run.reached is False:
         within = "within the budget of" if run.stopped_by is None else f"before {run.stopped_by}, after"

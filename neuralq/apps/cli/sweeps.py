@@ -18,11 +18,13 @@ from neuralq.apps.cli.option_table import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
 from neuralq.runs.children import python_command
+from neuralq.runs.control import CONTROL
 from neuralq.runs.evaluation import shown
+from neuralq.runs.folder.origin import flat_names
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
-from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.sweep import (
     Status,
     Sweep,
@@ -71,7 +73,7 @@ def _default_path(config: RunConfig) -> Path:
 
 def started_from(config: RunConfig, options: TrainOptions) -> str:
     """Where the settings come from that nobody gave, for the first line of a run."""
-    preset = f"; preset for {config.env}, {config.learner} learner (see neuralq presets)" if options.preset else ""
+    preset = f"; {options.preset} (see neuralq presets)" if options.preset else ""
     if not options.notes:
         return preset
     return f"{preset}; within {config.total_steps:,} steps {', '.join(options.notes)}"
@@ -91,7 +93,19 @@ def resume_seeds(
         runs = [run for run in map(sweep.run_path, sweep.seeds) if is_run_folder(run)]
         for config in (sweep.config, *map(read_config, runs)):
             refuse_strangers(config, *(name for name in sweep.options if ":" in name))
-    return _run(open_sweep(path, total_steps, changes), num_workers, as_json, "")
+    plain = config_to_dict(CONTROL.changed(config_from_dict(open_sweep(path).config), None, changes))
+    parts = {name.partition(".")[0]: plain[name.partition(".")[0]] for name in changes}
+    return _run(open_sweep(path, total_steps, parts), num_workers, as_json, "")
+
+
+def add_which(parser: argparse.ArgumentParser) -> None:
+    """Which of a run's two agents is meant: ``best`` is None where it is left to the run."""
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--best", action="store_true", default=None,
+        help="take the parameters whose evaluation scored highest; default: the agent of the run, which its end names",
+    )  # fmt: skip
+    which.add_argument("--final", action="store_false", dest="best", help="take the last parameters")
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +156,7 @@ def _command(sweep: Sweep, seed: int) -> list[str]:
     if is_run_folder(path):
         options = list(sweep.options)
         hooks = options[options.index("--hook") :] if "--hook" in options else []
-        told = [f"--{n.replace('_', '-')}={str(value).lower()}" for n, value in _moved(sweep, path).items()]
+        told = [f"--set={name}={'none' if value is None else value}" for name, value in _moved(sweep, path).items()]
         return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hooks]
     config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
     return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
@@ -154,8 +168,9 @@ def _moved(sweep: Sweep, run: str) -> dict[str, Any]:
         began = read_config(run)
     except RunFolderError:  # its process will say so
         return {}
-    names = [name for name in ("stop_at_return", "device") if name in sweep.config and name in began]
-    return {name: sweep.config[name] for name in names if sweep.config[name] != began[name]}
+    wanted, began = flat_names(sweep.config), flat_names(began)
+    names = [name for name in sorted(CONTROL.may_change() - {CONTROL.budget}) if name in wanted and name in began]
+    return {name: wanted[name] for name in names if wanted[name] != began[name]}
 
 
 def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:

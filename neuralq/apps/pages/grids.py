@@ -23,14 +23,21 @@ def short(value: float) -> str:
 
 
 def best_actions(q: ArrayLike, tol: float = 1e-9) -> NDArray[np.bool_]:
-    """Every action within ``tol`` of the best of its state, ``[S, A]``; NaN marks illegal ones.
+    """Every action that is the best of its state but for rounding, ``[S, A]``; NaN marks illegal ones.
+
+    Args:
+        q: values ``[S, A]``.
+        tol: how far below the best an action may be, as a share of the largest |q|: ties do not depend on the unit.
 
     Example:
         >>> best_actions([[1.0, 1.0, np.nan]]).tolist()
         [[True, True, False]]
     """
-    values = np.nan_to_num(np.asarray(q, dtype=np.float64), nan=-np.inf)
-    return np.asarray((values >= values.max(axis=1, keepdims=True) - tol) & np.isfinite(values))
+    values = np.asarray(q, dtype=np.float64)
+    legal = np.isfinite(values)
+    values = np.where(legal, values, -np.inf)
+    slack = tol * float(np.abs(values[legal]).max(initial=0.0))
+    return np.asarray((values >= values.max(axis=1, keepdims=True) - slack) & legal)
 
 
 def policy_grid(title: str, signs: str, num_columns: int, v: ArrayLike, actions: NDArray[np.bool_]) -> GridDrawing:

@@ -155,4 +155,5 @@ GRADIENT = LearnerKind(
     normalises=lambda s: (s.normalise_observations, s.scale_rewards),
     check=_check,
     place=5,
+    step_sizes=("step_size", "step_size_h"),
 )

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 
 from neuralq.learners import state
-from neuralq.learners.descent import Descent, count_update
+from neuralq.learners.descent import Descent
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import Distribution, Moved, distributions
+from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.distributional import atoms, distribution_of
 from neuralq.q.engine import Engine, TorchEngine
@@ -71,7 +72,8 @@ class DistributionalLearner:
         self.num_updates = 0
         self._options = settings.options
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
-        self._parts = {"descent": self._descent}
+        self._average = average_for(engine, settings)
+        self._parts = {"descent": self._descent, "average": self._average}
         engine.sync_target()
 
     def targets(self, transition: Transition) -> Tensor:
@@ -112,9 +114,10 @@ class DistributionalLearner:
         each.mean().backward()  # type: ignore[no-untyped-call]
         errors = aim - distribution_of(self.engine.q).mean(outputs.detach())
         self._descent.step()
-        count_update(self, self.settings.target_period_updates)
+        finish_update(self)
         return Update(errors, aim)
 
+    evaluation_parameters = evaluation_parameters
     begin_streams = state.begin_streams
     state_dict = state.state_dict
     load_state_dict = state.load_state_dict

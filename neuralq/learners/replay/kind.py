@@ -2,27 +2,59 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits
 from neuralq.learners.replay.distributional import DistributionalLearner
 from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead, has_hidden_units
 from neuralq.learners.replay.learner import ReplayLearner
+from neuralq.learners.replay.noisy import NoisyLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.engine import Loss, TorchEngine
+from neuralq.q.noisy import made_noisy
 from neuralq.rules.one_step import DOUBLE
+from neuralq.types import QFunction
 
 __all__ = ["REPLAY"]
 
 
-def _build(parts: Parts) -> ReplayLearner | DistributionalLearner | DQRCLearner:
+def _build(parts: Parts) -> ReplayLearner | DistributionalLearner | DQRCLearner | NoisyLearner:
     settings: ReplaySettings = parts.settings
-    if settings.returns is not MEAN:
-        assert isinstance(parts.engine, TorchEngine)
-        return DistributionalLearner(parts.engine, settings, parts.reward_scale, parts.rng)
+    if settings.noisy:
+        return NoisyLearner(_plain(parts), parts.rng)
     if settings.rule.correction:
         head = TwinHead(parts.engine.q) if has_hidden_units(parts.engine.q) else parts.another()  # all 0, as it starts
         return DQRCLearner(parts.engine, head, settings, parts.reward_scale)
-    return ReplayLearner(parts.engine, settings, parts.reward_scale)
+    return _plain(parts)
+
+
+def _plain(parts: Parts) -> ReplayLearner | DistributionalLearner:
+    """Without a second function, and whatever the layers."""
+    settings: ReplaySettings = parts.settings
+    if settings.returns is MEAN:
+        return ReplayLearner(parts.engine, settings, parts.reward_scale)
+    assert isinstance(parts.engine, TorchEngine)
+    return DistributionalLearner(parts.engine, settings, parts.reward_scale, parts.rng)
+
+
+def _represented(q: QFunction, settings: ReplaySettings, reward_scale: float, rng: np.random.Generator) -> QFunction:
+    q = made_noisy(q, rng) if settings.noisy else q
+    return settings.returns.represent(q, settings, reward_scale, rng)
+
+
+def _check_noisy(representation: Representation) -> None:
+    if representation.layout in ("table", "linear"):
+        raise ValueError(
+            f"noisy layers take the place of dense ones, and layout={representation.layout!r} has none; use "
+            "layout='action-output', or leave noisy out"
+        )
+    if representation.engine == "compiled":
+        raise ValueError("engine='compiled' has no kernels for noisy layers; use engine='auto'")
+    if getattr(getattr(representation, "body", None), "sparsity", 0.0):
+        raise ValueError("noisy layers start as Fortunato et al. (2018) have them, not sparse; leave sparsity out")
 
 
 def _check(settings: ReplaySettings, representation: Representation) -> None:
@@ -32,6 +64,8 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
             "dqrc puts its second function on the last hidden units of the network, and dueling has two such layers; "
             "leave dueling out"
         )
+    if settings.noisy:
+        _check_noisy(representation)
     if representation.engine == "compiled" and settings.returns is not MEAN:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
@@ -47,13 +81,14 @@ REPLAY = LearnerKind(
         step_size=s.learning_rate,
         plain_steps=s.optimiser == "sgd",
         lambda_=0.0 if s.block_length == 1 else s.lambda_,
-        target_period=s.target_period_updates,
+        target_period=s.target_period_updates if s.target_rate is None else math.ceil(1 / s.target_rate),
         replay=True,
         double=s.rule is DOUBLE,
     ),
     loss=lambda s: Loss("huber" if s.loss == "huber" else "squared"),
     outputs=lambda s, layout: s.returns.outputs(s, layout),
-    represent=lambda q, s, reward_scale, rng: s.returns.represent(q, s, reward_scale, rng),
+    represent=_represented,
     check=_check,
     place=2,
+    step_sizes=("learning_rate", "dqrc_learning_rate"),
 )

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from neuralq.learners import state
-from neuralq.learners.descent import Descent, count_update
+from neuralq.learners.descent import Descent
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.conservative import conservative_gradient
 from neuralq.learners.replay.distributions.record import MEAN
+from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
 from neuralq.q.engine import Engine
@@ -58,7 +60,8 @@ class ReplayLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
-        self._parts = {"descent": self._descent}
+        self._average = average_for(engine, settings)
+        self._parts = {"descent": self._descent, "average": self._average}
         self._options = settings.options
         self._is_plain = settings.rule is Q_LEARNING
         self._seen: Transition | None = None
@@ -86,8 +89,12 @@ class ReplayLearner:
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)
-        errors = self._descent.fit(s, a, targets, weight)
-        count_update(self, self.settings.target_period_updates)
+        if self.settings.conservative_alpha:
+            errors = conservative_gradient(self.engine, s, a, targets, weight, self.settings.conservative_alpha)
+            self._descent.step()
+        else:
+            errors = self._descent.fit(s, a, targets, weight)
+        finish_update(self)
         return Update(errors, targets)
 
     def _arrays_of(self, transition: Transition) -> tuple[Array, ...] | None:
@@ -98,7 +105,7 @@ class ReplayLearner:
         if transition is not self._seen:
             self._seen, self._seen_arrays = transition, None
             t, dtype = transition, self.engine.flat.values.dtype
-            plain = self._descent.on_arrays is not None and self._is_plain
+            plain = self._descent.on_arrays is not None and self._is_plain and not self.settings.conservative_alpha
             alike = t.r_t.dtype == t.discount_t.dtype == dtype and t.r_t.shape == t.discount_t.shape == t.a_tm1.shape
             if plain and alike and t.r_t.dim() == 1 and len(t.s_tm1) == len(t.s_t) == len(t.r_t):
                 self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))
@@ -111,9 +118,10 @@ class ReplayLearner:
         q_t = self._descent.on_arrays.all_arrays(s_t, target=True)
         targets = q_learning_array_targets(r_t, discount_t, q_t, self.reward_scale)
         errors = self._descent.fit(s_tm1, a_tm1, targets, weight)
-        count_update(self, self.settings.target_period_updates)
+        finish_update(self)
         return Update(torch.from_numpy(errors), torch.from_numpy(targets))
 
+    evaluation_parameters = evaluation_parameters
     begin_streams = state.begin_streams
     state_dict = state.state_dict
     load_state_dict = state.load_state_dict

@@ -65,6 +65,12 @@ class ReplaySettings:
         train_period: environment steps between updates.
         updates_per_period: updates at each of those times.
         target_period_updates: updates between copies into the target network; None for 500 (dqrc has none).
+        target_rate: τ in (0, 1]; in place of copies the target network moves by τ of the way at every update (Lillicrap
+            et al., 2016).
+        average_updates: greedy play is by an average of the parameters that forgets over about so many updates (Polyak
+            & Juditsky, 1992); None plays with the last.
+        noisy: whether the dense layers of a network are noisy, which explores by itself, so that ε may be 0 (Fortunato
+            et al., 2018).
         learning_rate: of the optimiser.
         optimiser: "adam", "radam" or "sgd".
         loss: "huber" or "squared"; None for the rule's own (Huber's; of dqrc squared, of categories cross-entropy).
@@ -77,6 +83,8 @@ class ReplaySettings:
         temperature: τ of a rule's policy softmax(q/τ), in units of scaled rewards; None for 0.03.
         munchausen_alpha: α, how much of τ log π is added to the reward; None for 0.9.
         munchausen_floor: the smallest τ log π that counts, in units of scaled rewards; None for -1.
+        conservative_alpha: α of the penalty α·(log Σₐ exp Q(s, a) − Q(s, a_taken)), by which values of actions that
+            nobody took stay low (CQL(H); Kumar et al., 2020); 0 for none.
         target_epsilon: ε of the ε-greedy target policy of retrace, tree_backup and harutyunyan; None for 0.05.
         dqrc_beta: how strongly the second function of dqrc is pulled to 0; None for 1.
         dqrc_learning_rate: of the second function of dqrc; None for the learning rate.
@@ -93,6 +101,9 @@ class ReplaySettings:
     train_period: int = 1
     updates_per_period: int = 1
     target_period_updates: int | None = None
+    target_rate: float | None = None
+    average_updates: float | None = None
+    noisy: bool = False
     learning_rate: float = 5e-4
     optimiser: str = "adam"
     loss: str | None = None
@@ -102,6 +113,7 @@ class ReplaySettings:
     num_atoms: int | None = None
     value_min: float | None = None
     value_max: float | None = None
+    conservative_alpha: float = 0.0
     temperature: float | None = None
     munchausen_alpha: float | None = None
     munchausen_floor: float | None = None
@@ -118,6 +130,8 @@ class ReplaySettings:
         check_positive("learning_rate", self.learning_rate)
         if self.max_grad_norm is not None:
             check_positive("max_grad_norm", self.max_grad_norm)
+        if not 0 <= self.conservative_alpha < float("inf"):
+            raise ValueError(f"conservative_alpha must be at least 0 and finite, got {self.conservative_alpha!r}")
         check_choice("target_rule", self.target_rule, target_rules())
         check_choice("distribution", self.distribution, distributions())
         Optimiser(self.optimiser)
@@ -156,7 +170,15 @@ class ReplaySettings:
             )
             what = rule if self.rule.correction else learned
             raise ValueError(f"loss={self.loss!r} does not go with {what}, which has {losses[0]!r}; leave loss out")
-        _settle(self, "target_period_updates", 500, not self.rule.correction, f"{rule} {self.rule.correction}")
+        why = f"{rule} {self.rule.correction}"
+        for name in ("target_rate", "average_updates"):
+            _settle(self, name, None, not self.rule.correction, why)
+        if self.noisy and self.rule.correction:
+            raise ValueError(f"noisy=True would be ignored by the second function of {rule}; leave noisy out")
+        if self.target_rate is not None:
+            why = f"target_rate={self.target_rate:g} moves the target network at every update"
+        copies = not self.rule.correction and self.target_rate is None
+        _settle(self, "target_period_updates", 500, copies, why)
         atoms = self.returns.num_atoms
         _settle(self, "num_atoms", atoms, atoms is not None, f"{learned} has no atoms")
         for name in ("value_min", "value_max"):
@@ -167,6 +189,10 @@ class ReplaySettings:
             _settle(self, name, default, name in own, f"{rule} {option.lack}")
 
     def _check_own_numbers(self) -> None:
+        if self.target_rate is not None and not 0 < self.target_rate <= 1:
+            raise ValueError(f"target_rate must lie in (0, 1], got {self.target_rate}; 0.005 is usual, 1 copies")
+        if self.average_updates is not None and not 1 <= self.average_updates < float("inf"):
+            raise ValueError(f"average_updates must be a finite number of at least 1, got {self.average_updates}")
         for name, least in (("target_period_updates", 1), ("num_atoms", self.returns.least_atoms)):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), least)
@@ -215,6 +241,12 @@ def _check_blocks(settings: ReplaySettings) -> None:
 
 def _check_combination(settings: ReplaySettings) -> None:
     """What the rule says it does not go with, in its words."""
+    if settings.conservative_alpha and (settings.returns is not MEAN or settings.rule.correction):
+        what = "distribution" if settings.returns is not MEAN else "target_rule"
+        raise ValueError(
+            f"conservative_alpha is for means that are learned from frozen targets, got {what}="
+            f"{getattr(settings, what)!r}; leave one of them out"
+        )
     met = {
         "num_steps": settings.num_steps > 1,
         "distribution": settings.returns is not MEAN,

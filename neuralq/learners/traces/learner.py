@@ -252,4 +252,5 @@ ONLINE = LearnerKind(
     experience="steps",
     traits=lambda s: Traits(s.step_size, lambda_=s.lambda_),
     place=3,
+    step_sizes=("step_size",),
 )

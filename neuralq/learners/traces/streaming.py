@@ -300,4 +300,5 @@ STREAMING = LearnerKind(
     traits=lambda s: Traits(s.eta_or_alpha, plain_steps=False, lambda_=s.lambda_),
     normalises=lambda s: (s.normalise_observations, s.scale_rewards),
     place=4,
+    step_sizes=("step_size",),
 )

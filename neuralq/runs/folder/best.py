@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neuralq.runs.folder.checkpoint import CheckpointError, load_newest, save
 from neuralq.runs.folder.origin import compared
-from neuralq.runs.folder.run_folder import is_run_folder, read_config
+from neuralq.runs.folder.run_folder import is_run_folder, read_changes, read_config
 
 __all__ = ["BEST_FOLDER", "Best", "keep_best", "load_best"]
 
@@ -79,7 +79,7 @@ def load_best(run_dir: str | Path) -> Best:
     saved = load_newest(folder)
     state = saved.state
     if is_run_folder(run_dir):
-        compared(state.get("origin"), read_config(run_dir), saved.path)
+        compared(state.get("origin"), read_config(run_dir), saved.path, read_changes(run_dir))
     try:
         parameters = torch.as_tensor(state["parameters"])
         kept = parameters, state.get("normalisation"), state.get("scalings")

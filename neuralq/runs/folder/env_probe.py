@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from neuralq.runs.folder.env_encode import Encoder, NotCopyable, difference, encode_env
 from neuralq.runs.folder.env_restore import restore_env
 
-__all__ = ["PROBE_SECONDS", "Resumability", "is_resumable", "untried"]
+__all__ = ["PROBE_SECONDS", "SIMULATED", "Resumability", "is_resumable", "untried"]
 
 NUM_STEPS_BEFORE = 25  # most episodes are under way by then, and some have ended
 NUM_STEPS_AFTER = 50
@@ -37,6 +37,9 @@ class Resumability:
 
     def __bool__(self) -> bool:
         raise TypeError("ask for .exact: a Resumability is neither true nor false")
+
+
+SIMULATED = Resumability(True, "resumes bit-exact: the environment's model is simulated, all of whose state is saved")
 
 
 def untried(env: Any) -> Resumability:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import library_versions
 
-__all__ = ["ARITHMETIC", "compared", "present"]
+__all__ = ["ARITHMETIC", "compared", "flat_names", "present"]
 
 ARITHMETIC = frozenset(("device", "engine", "threads"))
 """Fields of configurations that say how to compute, and not what."""
@@ -66,13 +66,16 @@ def _arithmetic(device: str) -> dict[str, str]:
     return found | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
 
 
-def compared(saved: Any, config: Mapping[str, Any], place: object) -> str | None:
+def compared(
+    saved: Any, config: Mapping[str, Any], place: object, changes: Sequence[Mapping[str, Any]] = ()
+) -> str | None:
     """What decides the bits and differs from when something was saved, in words; None if nothing does.
 
     Args:
         saved: from `present`, then; None where it was saved by a version that kept none.
         config: of the run now.
         place: what was saved, for the message.
+        changes: of the run, as `neuralq.runs.folder.run_folder.read_changes` has them: what was changed on purpose.
 
     Raises:
         CheckpointError: if what was saved belongs to a run of another configuration, naming what differs.
@@ -80,10 +83,13 @@ def compared(saved: Any, config: Mapping[str, Any], place: object) -> str | None
     if not isinstance(saved, Mapping):
         return None
     now = present(config)
-    then_config, now_config = (_flat(json.loads(str(origin["config"]))) for origin in (saved, now))
+    then_config, now_config = (flat_names(json.loads(str(origin["config"]))) for origin in (saved, now))
     # A name that only the present one has came with another version of the library, which has a default for it.
     differing = [n for n in then_config if now_config.get(n) != then_config[n]]
-    wrong = [n for n in differing if n.partition(".")[0] not in ARITHMETIC]
+    asked = {n: new for row in changes for n, (_, new) in row["changes"].items()}
+    wrong = [
+        n for n in differing if n not in ARITHMETIC and not ("." in n and n in asked and asked[n] == now_config.get(n))
+    ]
     if wrong:
         wrong.sort(key=lambda n: n not in now_config)
         told = ", ".join(f"{n} was {then_config[n]!r} there and is {now_config.get(n)!r} here" for n in wrong[:4])
@@ -98,11 +104,17 @@ def compared(saved: Any, config: Mapping[str, Any], place: object) -> str | None
     return ", ".join(f"{name} was {then} and is {here}" for name, (then, here) in changed.items()) or None
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_names(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Plain values of a configuration by full name, with a dot those of a part.
+
+    Example:
+        >>> flat_names({"seed": 3, "rollout": {"num_envs": 2}})
+        {'seed': 3, 'rollout.num_envs': 2}
+    """
     found: dict[str, Any] = {}
     for name, value in config.items():
         if isinstance(value, Mapping) and value and name != "env_kwargs":  # whose names are not ours
-            found |= _flat(value, f"{prefix}{name}.")
+            found |= flat_names(value, f"{prefix}{name}.")
         else:
             found[f"{prefix}{name}"] = value
     return found

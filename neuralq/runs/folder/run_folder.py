@@ -3,6 +3,7 @@
     config.json     the effective configuration       run.json       seed and format; written last, so it marks a run
     versions.json   of Python and the libraries       metrics.jsonl  one JSON object per line, flushed
                                                       (each with a checksum, ``crc32``)
+    changes.jsonl   what it went on with otherwise
     summary.json    the final result                  checkpoints/   see `neuralq.runs.folder.checkpoint`
     run.lock        held by the one writer            report.html    see `neuralq.runs.report`
 
@@ -51,6 +52,7 @@ __all__ = [
     "default_run_path",
     "is_run_folder",
     "library_versions",
+    "read_changes",
     "read_config",
     "read_metrics",
     "read_seed",
@@ -61,7 +63,7 @@ __all__ = [
 
 FORMAT_NAME = "neuralq-run"
 FORMAT_VERSION = 1
-_FILES = ("config.json", "versions.json", "run.json", "metrics.jsonl", "summary.json")
+_FILES = ("config.json", "versions.json", "run.json", "metrics.jsonl", "summary.json", "exact.json")
 _FOLDERS = ("checkpoints", "best", "tensorboard", "wandb")
 _LIBRARIES = ("torch", "numpy", "scipy", "gymnasium", "numba", "safetensors")
 
@@ -198,6 +200,18 @@ class RunFolder:
         write_durably(self.path / "config.json", to_json(config, "config"))
         self.config = dict(config)
 
+    def record_changes(self, env_steps: int, changes: Mapping[str, tuple[Any, Any]]) -> None:
+        """One line more in ``changes.jsonl``: from here on the run goes on otherwise than it was told before.
+
+        Args:
+            env_steps: where it stands.
+            changes: old and new value by name.
+        """
+        self._check_open()
+        told = {name: list(values) for name, values in changes.items()}
+        row = {"env_steps": env_steps, "time": datetime.now().isoformat(timespec="seconds"), "changes": told}
+        append_line(self.path / "changes.jsonl", row_line(plain_values(row, "changes")))
+
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """The final result, replaced in one step; NaN and infinities become null.
 
@@ -305,6 +319,19 @@ def read_config(path: str | Path) -> dict[str, Any]:
     """
     _read_marker(Path(path))
     return read_json(Path(path) / "config.json")
+
+
+def read_changes(path: str | Path) -> list[dict[str, Any]]:
+    """What a run went on with otherwise than it was told before: ``env_steps``, ``time``, and old and new by name.
+
+    Raises:
+        RunFolderError: if a line other than the last is damaged.
+
+    Example:
+        >>> read_changes("/nowhere")
+        []
+    """
+    return read_rows(Path(path) / "changes.jsonl")
 
 
 def read_seed(path: str | Path) -> int:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import copy
+from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
@@ -21,17 +23,21 @@ from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.rules import Linear
+from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS
-from neuralq.runs.folder.env_probe import PROBE_SECONDS, Resumability, is_resumable, untried
+from neuralq.runs.folder.env_probe import PROBE_SECONDS, SIMULATED, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
+from neuralq.runs.offline.files import read_recorded
+from neuralq.runs.offline.playback import OFFLINE, OfflineExperience, Playback, rows_of, whole_buffer
 from neuralq.runs.recipe.config import RunConfig
-from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs
+from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs, make_one
 from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
-from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec
+from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
-from neuralq.runs.stream.encoding import encoder_for
+from neuralq.runs.stream.encoding import discrete_actions, encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
+from neuralq.runs.stream.table import TableWalk
 from neuralq.types import QFunction, Transition
 
 __all__ = [
@@ -121,9 +127,12 @@ def build_session(config: RunConfig) -> Session:
         ValueError: for environments and combinations that cannot be learned, with the way out.
     """
     _check_device(config.device)
-    envs = make_envs(config, _num_envs(config), training=True)
+    if config.kind.experience == "table":
+        return _walking_session(config)
+    offline = config.dataset is not None
+    envs = make_envs(config, 1 if offline else _num_envs(config), training=not offline)
     try:
-        return _session(config, envs)
+        return _with_data(config, _session(config, envs)) if offline else _session(config, envs)
     except BaseException:
         with contextlib.suppress(Exception):
             envs.close()
@@ -144,14 +153,79 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     frozen = None if normalisation is None else normalisation.frozen()
-    probe = _probe(config, envs)
+    probe = (
+        OFFLINE
+        if config.dataset is not None
+        else _probe(config, envs, lambda: make_envs(config, _num_envs(config), training=True))
+    )
     _warm(config, engine, stream)
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
         stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
-        _value_range(config.settings),
+        _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
+
+
+def _with_data(config: RunConfig, session: Session) -> Session:
+    """The session with recorded experience in place of what it would have met."""
+    assert config.dataset is not None and isinstance(session.stream, Interaction)
+    settings, data, stream = config.settings, read_recorded(config.dataset), session.stream
+    if stream.spec.masked:
+        raise ValueError("a data set says nothing of illegal actions, and this environment masks some; train in it")
+    if settings.rule.behaviour and data.probabilities is None:
+        raise ValueError(
+            f"target_rule={settings.target_rule!r} needs the probabilities with which actions were taken, and the data "
+            "set has none; neuralq record leaves them, or use tree_backup"
+        )
+    _, first_action = discrete_actions(stream.envs.single_action_space)
+    rows = rows_of(data, stream.encoder, first_action, stream.num_actions, config.gamma)
+    drawing = ReplayExperience(
+        whole_buffer(rows, settings), session.generators["samples"], settings.batch_size, settings.block_length,
+        settings.train_period, settings.train_period, settings.updates_per_period,
+    )  # fmt: skip
+    session.stream, session.experience = (
+        Playback(stream, data, config.dataset),
+        OfflineExperience(drawing, data, config.dataset),
+    )
+    session._early = None
+    if session.beside is not None:
+        session.beside.see(rows[0], rows[1])
+    return session
+
+
+def _walking_session(config: RunConfig) -> Session:
+    """Of a learner that acts by itself, in one environment or its model."""
+    envs: Any = make_one(config)
+    try:
+        simulate = config.settings.simulate
+        stream = TableWalk(envs, config.gamma, seed_for(config.seed, 0), simulate, config.reward_scale)
+        rng = np.random.default_rng(seed_for(config.seed, 2))
+        require_room(config, stream.spec)
+        engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(config.settings), config.engine)
+        learner = _learner(config, engine, stream.spec, rng)
+        stream.begin(learner)
+        cap = MOST_STEPS if config.evaluation_max_steps is None and stream.time_limit else config.evaluation_max_steps
+        return Session(
+            stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None),
+            SIMULATED if stream.simulated else _probe(config, envs, lambda: make_one(config)),
+            config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
+            beside=_beside_a_walk(config, envs, stream),
+        )  # fmt: skip
+    except BaseException:
+        with contextlib.suppress(Exception):
+            envs.close()
+        raise
+
+
+def _beside_a_walk(config: RunConfig, env: gym.Env[Any, Any], stream: TableWalk) -> Beside | None:
+    """The exact answer beside action values; what else is learned on a table aims at something else."""
+    algorithm = config.settings.algorithm
+    if config.settings.discounts:
+        return Beside.of(make_vector_env(lambda: env, 1), stream.spec, config.gamma, config.exact)
+    if config.exact:
+        raise ValueError(f"exact=True compares discounted values of actions, and {algorithm} learns none; leave it out")
+    return None
 
 
 def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
@@ -163,11 +237,11 @@ def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
         raise
 
 
-def _probe(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Resumability:
+def _probe(config: RunConfig, envs: Any, make: Callable[[], Any]) -> Resumability:
     if not config.resume_probe:
         return untried(envs)
     return is_resumable(
-        lambda: make_envs(config, _num_envs(config), training=True),
+        make,
         seed_for(config.seed, 5),
         np.random.default_rng(seed_for(config.seed, 6)),
         PROBE_SECONDS,
@@ -213,6 +287,7 @@ def _learner(config: RunConfig, engine: Engine, spec: ObservationSpec, rng: np.r
     parts = Parts(
         engine, config.settings, rng, config.gamma, config.reward_scale, config.total_steps, config.engine,
         another=lambda: _q_on_device(config, spec, 11),
+        exploration=(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps),
     )  # fmt: skip
     return config.kind.build(parts)
 

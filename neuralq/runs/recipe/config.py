@@ -16,7 +16,16 @@ from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
 from neuralq.runs.recipe.games import is_screen
 
-__all__ = ["LAYOUTS", "LEARNERS", "RunConfig", "body_to_dict", "config_from_dict", "config_to_dict", "fitted_value"]
+__all__ = [
+    "LAYOUTS",
+    "LEARNERS",
+    "RunConfig",
+    "body_to_dict",
+    "config_from_dict",
+    "config_to_dict",
+    "fitted_value",
+    "layout_for",
+]
 
 LAYOUTS = ("table", "linear", "action-input", "separate", "action-output")
 LEARNERS = learner_kinds()
@@ -32,7 +41,14 @@ _MOST_SHOWN = 100
 _Class = TypeVar("_Class")
 
 if TYPE_CHECKING:
-    from neuralq.learners import GradientSettings, OnlineSettings, ReplaySettings, RolloutSettings, StreamingSettings
+    from neuralq.learners import (
+        GradientSettings,
+        OnlineSettings,
+        ReplaySettings,
+        RolloutSettings,
+        StreamingSettings,
+        TabularSettings,
+    )
 
 
 def _with_learners(cls: type[_Class]) -> type[_Class]:
@@ -60,7 +76,8 @@ class RunConfig:
         clip_rewards: whether training sees rewards clipped to between −1 and 1 (Mnih et al., 2015); Atari screens only.
         end_on_life_loss: whether in training a lost life ends the game and begins another; Atari screens only.
         learner: name of a learner; `neuralq.learners.learner_kinds` has them all.
-        layout: "table", "linear", "action-input", "separate" or "action-output".
+        layout: "table", "linear", "action-input", "separate" or "action-output"; "auto" for what goes with the learner:
+            a table with "tabular", else "action-output".
         seed: from which every generator is derived.
         total_steps: environment steps, summed over parallel environments.
         stop_at_return: stop once a greedy evaluation averages at least this.
@@ -79,9 +96,15 @@ class RunConfig:
         resume_probe: whether it is tried, for a second at most, if the environment's state can be saved and put back.
         checkpoint_every: environment steps between checkpoints.
         log_every: environment steps between rows of training metrics.
+        exact: whether the environment's model is solved and the exact answer shown beside what is learned; None for
+            models that are solved within a second, true for any.
+        monitor: whether the run is watched for divergence.
         engine: "auto", "torch" or "compiled".
         device: "cpu", "cuda", "cuda:1", ….
         threads: CPU threads for linear algebra; small networks are fastest on one.
+        dataset: recorded experience to learn from in place of steps in the environment, "minari:ID" or a file.npz; with
+            the replay learner. A step of the budget is then what updates would follow.
+        warm_start: run folder with whose weights, and statistics of observations, the run begins; None for new ones.
     """
 
     env: str = "CartPole-v1"
@@ -89,7 +112,7 @@ class RunConfig:
     clip_rewards: bool = False
     end_on_life_loss: bool = False
     learner: str = "rollout"
-    layout: str = "action-output"
+    layout: str = "auto"
     seed: int = 0
     total_steps: int = 100_000
     stop_at_return: float | None = None
@@ -106,6 +129,7 @@ class RunConfig:
         replay: ReplaySettings | None = None
         rollout: RolloutSettings | None = None
         streaming: StreamingSettings | None = None
+        tabular: TabularSettings | None = None
     else:
         learners: None
     evaluate_every: int = 4096
@@ -114,17 +138,24 @@ class RunConfig:
     resume_probe: bool = True
     checkpoint_every: int = 50_000
     log_every: int = 1024
+    exact: bool | None = None
+    monitor: bool = True
     engine: str = "auto"
     device: str = "cpu"
     threads: int = 1
+    dataset: str | None = None
+    warm_start: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse values outside their range and settings that would be ignored; fill in the learner's defaults."""
+        if self.warm_start is not None:  # a run itself will do
+            object.__setattr__(self, "warm_start", str(getattr(self.warm_start, "run_dir", self.warm_start)))
         for name, value in _fitted(
             "", {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}, RunConfig
         ).items():
             object.__setattr__(self, name, value)
         check_choice("learner", self.learner, LEARNERS)
+        object.__setattr__(self, "layout", layout_for(self.learner, self.layout))
         check_choice("layout", self.layout, LAYOUTS)
         check_choice("engine", self.engine, ("auto", "torch", "compiled"))
         check_discount("gamma", self.gamma)
@@ -152,7 +183,9 @@ class RunConfig:
         _check_body(self)
         _check_outputs(self)
         self.kind.check(self.settings, self)
+        _check_exploration(self)
         _check_game(self)
+        _check_dataset(self)
 
     @property
     def kind(self) -> LearnerKind:
@@ -163,6 +196,16 @@ class RunConfig:
     def settings(self) -> Any:
         """The settings of the learner that runs."""
         return getattr(self, self.learner)
+
+
+def layout_for(learner: str, layout: str = "auto") -> str:
+    """The layout that is meant.
+
+    Example:
+        >>> layout_for("tabular"), layout_for("online"), layout_for("online", "linear")
+        ('table', 'action-output', 'linear')
+    """
+    return LEARNERS[learner].layout if layout == "auto" and learner in LEARNERS else layout
 
 
 def _check_body(config: RunConfig) -> None:
@@ -202,6 +245,29 @@ def _check_outputs(config: RunConfig) -> None:
         )
     if config.engine == "compiled" and config.dueling:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
+
+
+def _check_exploration(config: RunConfig) -> None:
+    """A learner that acts by itself may have another policy than ε-greedy."""
+    plan = getattr(config.settings, "plan", {})
+    if plan.get("policy", "epsilon-greedy") == "epsilon-greedy":
+        return
+    for name in ("epsilon_start", "epsilon_end"):  # how fast ε falls is also said by the budget
+        if getattr(config, name) != getattr(RunConfig, name):
+            raise ValueError(
+                f"{name} would be ignored with the policy {plan['policy']!r}; leave it out, or act ε-greedily"
+            )
+
+
+def _check_dataset(config: RunConfig) -> None:
+    if config.dataset is None:
+        return
+    if config.kind.experience != "replay":
+        raise ValueError(f"the {config.learner} learner takes no recorded experience; use learner='replay'")
+    if config.clip_rewards or config.end_on_life_loss:
+        raise ValueError(
+            "recorded rewards and episodes are taken as they are; leave clip_rewards and end_on_life_loss out"
+        )
 
 
 def _check_game(config: RunConfig) -> None:

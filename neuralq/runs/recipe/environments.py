@@ -16,7 +16,7 @@ from neuralq.runs.recipe.stand_in import stand_in
 from neuralq.runs.stream import make_vector_env
 from neuralq_envs import vector_twin
 
-__all__ = ["has_time_limit", "make_envs", "make_evaluation_envs"]
+__all__ = ["has_time_limit", "make_envs", "make_evaluation_envs", "make_one"]
 
 _MOST_IN_TURN = 1000
 """Episodes of evaluation that are played one after another where their environments cannot exist side by side."""
@@ -52,6 +52,23 @@ def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> Vecto
                 return vectorised
         clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
         return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
+
+
+def make_one(config: RunConfig) -> gym.Env[Any, Any]:
+    """The single environment that a learner trains in which takes its steps by itself.
+
+    Raises:
+        ValueError: as `make_envs`.
+
+    Example:
+        >>> make_one(RunConfig(env="FrozenLake-v1", learner="tabular")).observation_space
+        Discrete(16)
+    """
+    env_id = config.env.rpartition(":")[2]
+    register_games(env_id)
+    with refusals_name(config.env):
+        own = stand_in() is not None or own_maker(config.env) is not None  # which imports the module
+        return make_single(config.env if own else env_id, config.env_kwargs)
 
 
 def _is_limit(limit: Any) -> bool:

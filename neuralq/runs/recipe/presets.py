@@ -8,10 +8,12 @@ from typing import Any
 from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict
+from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
+from neuralq.runs.recipe.games import ATARI
 from neuralq.runs.recipe.keywords import nested, with_body
+from neuralq.runs.recipe.replay_presets import ANY, REPLAY_PRESETS, agent_preset
 
-__all__ = ["PRESETS", "preset_for", "with_preset"]
+__all__ = ["PRESETS", "REACHED", "of_agent", "preset_for", "started", "under", "with_preset", "yielding"]
 
 _GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 _MINATAR: dict[str, Any] = {
@@ -43,24 +45,6 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             "anneal_to": 0.1,
             "refresh_targets": True,
             "average_updates": 8.0,
-        },
-    },
-    # Three rewards and double Q-learning: with one reward values are too slow, with the plain maximum they fall again.
-    ("CartPole-v1", "replay"): {
-        "total_steps": 60_000,
-        "reward_scale": 0.1,
-        "epsilon_end": 0.05,
-        "epsilon_decay_steps": 10_000,
-        "evaluate_every": 5_000,
-        "body": {"class": "MLP", "hidden": [64, 64], "layer_norm": True},
-        "replay": {
-            "learning_rate": 1e-3,
-            "batch_size": 128,
-            "learning_starts": 1_000,
-            "train_period": 2,
-            "target_rule": "double",
-            "num_steps": 3,
-            "target_period_updates": 250,
         },
     },
     # Rewards of −1 until the goal: values that start at 0 are optimistic, and explore by themselves: ε may fall soon.
@@ -192,6 +176,31 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         for game in _GAMES
         for learner in ("streaming", "gradient")
     },
+    # A card says little: α = 1/n averages over all of them, undiscounted, with every action taken now and then.
+    ("Blackjack-v1", "tabular"): {
+        "total_steps": 200_000,
+        "gamma": 1.0,
+        "epsilon_end": 0.1,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 50_000,
+        "evaluation_episodes": 200,
+        "tabular": {"schedule": "one-over-n"},
+    },
+    # The goal is rarely found on slippery ice: large steps as long as it is far away, then averages.
+    ("FrozenLake-v1", "tabular"): {
+        "epsilon_end": 0.1,
+        "evaluate_every": 20_000,
+        "evaluation_episodes": 100,
+        "tabular": {"schedule": "search-then-converge"},
+    },
+    ("FrozenLake8x8-v1", "tabular"): {
+        "total_steps": 500_000,
+        "epsilon_end": 0.1,
+        "epsilon_decay_steps": 100_000,
+        "evaluate_every": 100_000,
+        "evaluation_episodes": 100,
+        "tabular": {"schedule": "search-then-converge"},
+    },
     # Mitchell (1997), Figure 13.2, γ = 0.9 as there: one-step targets and actions drawn uniformly, for Q-learning needs
     # every pair and not a good policy. Values up to 1 and plain gradient steps serve a table and a network alike.
     ("neuralq/MitchellGrid-v0", "rollout"): {
@@ -211,11 +220,37 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
             "learning_rate": 0.5,
         },
     },
+    **REPLAY_PRESETS,
 }
 
 
+REACHED: dict[tuple[str, str], str] = {
+    ("CartPole-v1", "rollout"): "500.0 (486.1 to 500.0)",
+    ("Acrobot-v1", "rollout"): "−77.5 (−79.7 to −75.2)",
+    ("MountainCar-v0", "rollout"): "−101.7 (−119.5 to −100.3)",
+    ("LunarLander-v3", "rollout"): "272.8 (269.1 to 279.0)",
+    ("CartPole-v1", "streaming"): "500.0 (498.8 to 500.0)",
+    ("Acrobot-v1", "streaming"): "−116.0 (−298.3 to −91.1)",
+    ("MountainCar-v0", "streaming"): "−200 (−200 to −200)",
+    ("MinAtar/Asterix-v1", "rollout"): "57.1",
+    ("MinAtar/Breakout-v1", "rollout"): "29.0",
+    ("MinAtar/Freeway-v1", "rollout"): "65.5",
+    ("MinAtar/Seaquest-v1", "rollout"): "123.4",
+    ("MinAtar/SpaceInvaders-v1", "rollout"): "462.4",
+}
+"""Returns at the end, interquartile mean over seeds and interval, where docs/benchmarks.md has measured a preset."""
+
+_YIELDS = {
+    "target_rule": ("num_steps",),  # n was chosen for the preset's rule; others may refuse it
+    "block_length": ("num_steps", "target_rule"),
+    "target_rate": ("target_period_updates",),
+    "target_period_updates": ("target_rate",),
+}
+"""What of a preset gives way to a setting that is given."""
+
+
 def preset_for(env: str, learner: str) -> dict[str, Any]:
-    """The preset's values, empty where there is none.
+    """The preset's values: of the environment, else of any environment, empty where the learner has none.
 
     Example:
         >>> preset_for("CartPole-v1", "rollout")["reward_scale"]
@@ -223,10 +258,76 @@ def preset_for(env: str, learner: str) -> dict[str, Any]:
         >>> preset_for("Unknown-v0", "rollout")
         {}
     """
-    return PRESETS.get((env, learner), {})
+    found = PRESETS.get((env, learner))
+    if found is None and not env.startswith(ATARI):
+        found = PRESETS.get((ANY, learner))
+    return found or {}
 
 
-def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
+def started(env: str, learner: str, name: str | None = None) -> str:
+    """Which preset a run starts from, in words; empty where there is none.
+
+    Example:
+        >>> started("CartPole-v1", "rollout"), started("CartPole-v1", "replay", "rainbow")
+        ('preset for CartPole-v1, rollout learner', 'preset rainbow')
+    """
+    if name is not None:
+        return f"preset {name}"
+    where = env if (env, learner) in PRESETS else "any environment"
+    return f"preset for {where}, {learner} learner" if preset_for(env, learner) else ""
+
+
+def under(given: Mapping[str, Any], name: str | None = None) -> tuple[str, dict[str, Any]]:
+    """The learner of what is given, and the preset that stands under it.
+
+    Args:
+        given: settings by name; env, learner and layout decide.
+        name: of a whole agent, in place of the environment's preset.
+
+    Raises:
+        ValueError: there is no such learner or agent, or the agent is one of another learner.
+
+    Example:
+        >>> under({"env": "CartPole-v1"}, "rainbow")[0]
+        'replay'
+    """
+    env = str(given.get("env", RunConfig.env))
+    agent = {} if name is None else agent_preset(name, env)
+    learner = given.get("learner", agent.get("learner", RunConfig.learner))
+    check_choice("learner", learner, LEARNERS)
+    if learner != agent.get("learner", learner):
+        raise ValueError(f"preset {name} is for the {agent['learner']} learner, got {learner}; leave one of them out")
+    preset = agent or preset_for(env, learner)
+    if layout_for(learner, given.get("layout", RunConfig.layout)) not in NETWORKS:
+        own = (env, learner) in PRESETS  # tables and linear functions need other rates than networks
+        preset = {key: value for key, value in preset.items() if own and key != "body"}
+    return learner, preset
+
+
+def of_agent(plain: Mapping[str, Any], name: str | bool | None, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings with the learner of a named agent, where neither they nor others that are given name one.
+
+    Example:
+        >>> of_agent({"env": "CartPole-v1"}, "rainbow", {})
+        {'learner': 'replay', 'env': 'CartPole-v1'}
+    """
+    if not isinstance(name, str) or "learner" in plain or "learner" in given:
+        return plain
+    return {"learner": agent_preset(name, "")["learner"], **plain}
+
+
+def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a preset's settings of a learner can stand beside those that are given.
+
+    Example:
+        >>> yielding({"target_period_updates": 250, "learning_rate": 1e-3}, {"target_rate": 0.01})
+        {'learning_rate': 0.001}
+    """
+    gone = {over for name, overs in _YIELDS.items() if name in given for over in overs}
+    return {name: value for name, value in settings.items() if name not in gone}
+
+
+def with_preset(given: Mapping[str, Any] | str, *, preset: str | None = None, **settings: Any) -> RunConfig:
     """The configuration of what is given, over the preset of its environment and learner, over the defaults.
 
     Schedules that are not given end within a ``total_steps`` that is (`neuralq.runs.recipe.budget`).
@@ -234,6 +335,7 @@ def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
     Args:
         given: an environment's id; or as `config_to_dict` writes it, or any part of that; settings of the learner may
             be partial too.
+        preset: name of a whole agent, such as "rainbow", in place of the environment's preset.
         settings: fields of the configuration and, flat, settings of its learner; they win.
 
     Raises:
@@ -249,15 +351,9 @@ def with_preset(given: Mapping[str, Any] | str, **settings: Any) -> RunConfig:
             f"a preset belongs to the id of an environment, or a mapping that holds it as 'env', got {given!r}; an "
             "environment itself is taken by neuralq.train"
         )
-    plain = nested({"env": given} if isinstance(given, str) else given, settings)
-    learner = plain.get("learner", RunConfig.learner)
-    check_choice("learner", learner, LEARNERS)
-    preset = preset_for(plain.get("env", RunConfig.env), learner)
-    if plain.get("layout", RunConfig.layout) not in NETWORKS:
-        preset = {name: value for name, value in preset.items() if name != "body"}
-    preset, _ = cut_to_budget(preset, plain)
+    plain = nested(of_agent({"env": given} if isinstance(given, str) else given, preset, settings), settings)
+    learner, base = under(plain, preset)
+    base, _ = cut_to_budget(base, {**plain, "learner": learner})
     given_settings = plain.get(learner) or {}
-    merged = {learner: {**preset.get(learner, {}), **given_settings}}
-    if "target_rule" in given_settings and "num_steps" not in given_settings:
-        merged[learner].pop("num_steps", None)  # n was chosen for the preset's rule; others may refuse it
-    return config_from_dict(with_body({**preset, **plain, **merged}))
+    merged = {learner: {**yielding(base.get(learner, {}), given_settings), **given_settings}}
+    return config_from_dict(with_body({**base, **plain, **merged}))

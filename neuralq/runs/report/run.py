@@ -96,7 +96,7 @@ def _title(config: Mapping[str, Any], folder: Path) -> str:
 def _lead(rows: Sequence[Row], target: float | None) -> str:
     steps, returns = finite_series(rows, "evaluation", "greedy_return")
     if not len(steps):
-        return "No greedy evaluation has been recorded yet."
+        return _measured(rows) or "No greedy evaluation has been recorded yet."
     text = f"After {steps[-1]:,.0f} environment steps the greedy policy scores {returns[-1]:.4g} per episode."
     if target is None:
         return text
@@ -104,6 +104,17 @@ def _lead(rows: Sequence[Row], target: float | None) -> str:
     if len(reached):
         return f"{text} The target of {target:g} was first reached at {reached[0]:,.0f}."
     return f"{text} The target of {target:g} was not reached."
+
+
+def _measured(rows: Sequence[Row]) -> str | None:
+    """Of a run that predicts and does not act, the value of the start."""
+    steps, values = finite_series(rows, "evaluation", "start_value")
+    if not len(steps):
+        return None
+    text = f"After {steps[-1]:,.0f} environment steps the start is worth {values[-1]:.4g} under the policy watched"
+    _, errors = finite_series(rows, "evaluation", "value_error_rms")
+    exact = f"; values are {errors[-1]:.2g} from the exact ones (root mean square)" if len(errors) else ""
+    return f"{text}{exact}."
 
 
 def _facts(rows: Sequence[Row], summary: Mapping[str, Any]) -> dict[str, Any]:

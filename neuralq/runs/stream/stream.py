@@ -16,7 +16,7 @@ from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_act
 from neuralq.runs.stream.faults import EnvironmentFault, describe_error
 from neuralq.runs.stream.normalisation import Normalisation
 from neuralq.runs.stream.scaling import Scaling
-from neuralq.runs.stream.vector_env import SubEnv
+from neuralq.runs.stream.vector_env import SubEnv, as_number
 from neuralq.types import Array, Transition
 
 __all__ = ["Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
@@ -282,6 +282,9 @@ class Interaction:
 
     def _checked_reward(self, reward: Any) -> Array:
         try:
+            found = reward if isinstance(reward, np.ndarray) else np.array(reward)
+            for one in found.flat if found.dtype.kind in "OSU" else ():
+                as_number(one)
             r_t = np.array(reward, np.float64)
         except (TypeError, ValueError) as error:
             raise self._fault(f"field reward: must be numbers, got {reward!r}") from error

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from neuralq.checks import check_whole
 from neuralq.runs.stream.encoding import encoder_for
 
-__all__ = ["MASK_METHODS", "SubEnv", "SubEnvFault", "legal_actions", "make_vector_env", "what_it_did"]
+__all__ = ["MASK_METHODS", "SubEnv", "SubEnvFault", "as_number", "legal_actions", "make_vector_env", "what_it_did"]
 
 MASK_METHODS = ("action_masks", "valid_action_mask")
 """Methods by which environments tell their legal actions, for those that do not put them into info."""
@@ -98,7 +98,7 @@ class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
         except (Exception, SystemExit) as error:
             raise self._raised(error) from error
         try:
-            r_t = float(reward)
+            r_t = float(as_number(reward))
         except Exception as error:
             raise SubEnvFault(self.index, f": reward must be a number, got {reward!r}") from error
         if type(terminated) not in _FLAGS or type(truncated) not in _FLAGS:
@@ -144,6 +144,17 @@ class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not (self._whole and type(observation) in (int, np.int64)):
             self._encoder.encode_single(observation, env_index=self.index)
         return _copied(observation)
+
+
+def as_number(reward: Any) -> Any:
+    """The reward, if it is not the text of a number, which Python and NumPy would read as one.
+
+    Raises:
+        TypeError: it is text.
+    """
+    if isinstance(reward, str | bytes) or (isinstance(reward, np.ndarray) and reward.dtype.kind in "SU"):
+        raise TypeError("text is no number")
+    return reward
 
 
 def _copied(observation: Any) -> Any:

@@ -215,7 +215,7 @@ def _notes(config: TdGammonConfig, latest: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _load(run_dir: Path, best: bool) -> BackgammonAgent:
+def _load(run_dir: Path, best: bool | None) -> BackgammonAgent:
     if best:
         raise ValueError(f"a TD-Gammon run keeps its newest weights only, and {run_dir} is one; leave best out")
     return load_agent(run_dir)

@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 from neuralq.jit import lean_kernel
 from neuralq.tabular.kernels.random_numbers import Seed, new_stream, uniform
 from neuralq.tabular.model import ModelArrays
-from neuralq.tabular.policies import EPSILON_GREEDY, K_TO_THE_Q, POWER, RANDOM, SOFTMAX, VISITS, ActingCode, StepCode
+from neuralq.tabular.policies import (
+    EPSILON_GREEDY,
+    K_TO_THE_Q,
+    POWER,
+    RANDOM,
+    SEARCHING,
+    SOFTMAX,
+    VISITS,
+    ActingCode,
+    StepCode,
+)
 
 __all__ = [
     "BOOTSTRAPS",
@@ -293,6 +303,8 @@ def step_length(rule: StepCode, n: int) -> Any:
         return 1.0 / (1.0 + n)
     if rule.kind == POWER:
         return float(n) ** -rule.value
+    if rule.kind == SEARCHING:
+        return rule.value / (1.0 + (n - 1) / rule.scale)
     if rule.listed.size > 0:
         return rule.listed[np.uint64(min(n, rule.listed.size) - 1)]
     return rule.value
