@@ -88,7 +88,8 @@ def _found(one: Finding) -> str:
         else f", 95 % from {format_number(one.interval[0])} to {format_number(one.interval[1])}"
     )
     return (
-        f"<h3>{escape(one.title)}</h3>\n<p>{escape(one.evidence)}.</p>\n<p>{one.id}, grade {one.grade} "
+        f"<h3>{escape(one.title)}</h3>\n<p>{escape(one.evidence[:1].upper() + one.evidence[1:])}.</p>\n<p>{one.id}, "
+        f"grade {one.grade} "
         f"({_GRADES[one.grade]}): {format_number(one.value)}{interval}; {escape(_threshold(one))}.</p>\n"
         f"<p>Remedy: {escape(one.remedy)}.</p>\n<p>This would confirm it:</p>\n<pre>{escape(one.confirm)}</pre>"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
 
-__all__ = ["Clock", "EnvironmentRaised", "Episode", "Policy", "horizon", "play", "returns_from"]
+__all__ = ["Clock", "EnvironmentRaised", "Episode", "horizon", "play", "returns_from"]
 
 Policy = Callable[[Array, np.random.Generator], tuple[Indices, Floats]]
 """Observations ``[N, *obs]`` to actions ``[N]`` and the action values ``[N, A]`` that they were chosen by (or NaN)."""

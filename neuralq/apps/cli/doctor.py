@@ -57,24 +57,29 @@ def _parser() -> argparse.ArgumentParser:
         "state "
         "dict (.pth, .safetensors, .npz)",
     )
-    parser.add_argument("--env", metavar="ID", help="the environment, as 'ID' or 'module:ID'; of a run folder its own")
-    parser.add_argument(
-        "--net", metavar="module:Class", help="the network that a state dict belongs to, called without arguments"
+    add = parser.add_argument
+    add("--env", metavar="ID", help="the environment, as 'ID' or 'module:ID'; of a run folder its own")
+    add(
+        "--net",
+        metavar="M:C",
+        help="module:Class of the network that a state dict belongs to, called without arguments",
     )
-    parser.add_argument(
-        "--data", metavar="FILE.npz", help="what was learned from: obs, action, reward, terminated, truncated, next_obs"
-    )
-    parser.add_argument("--gamma", type=float, metavar="G", help="discount; by default the file's, else 0.99")
-    parser.add_argument(
-        "--set", type=_setting, nargs="+", action="extend", default=[], metavar="NAME=VALUE",
+    add("--data", metavar="NPZ", help="what was learned from: obs, action, reward, terminated, truncated, next_obs")
+    add("--gamma", type=float, metavar="G", help="discount; by default the file's, else 0.99")
+    add(
+        "--set", type=_setting, nargs="+", action="extend", default=[], metavar="NAME=X",
         help="settings of the training that the file does not hold: lr=1e-3 target_period_updates=500 updates=50000 …",
     )  # fmt: skip
-    parser.add_argument("--level", choices=LEVELS, default=LEVELS[0], help="how far to go (default: exam)")
-    parser.add_argument(
-        "--budget", type=_seconds, default=60.0, metavar="120s", help="time for all of it (default: 60s)"
+    add("--level", choices=LEVELS, default=LEVELS[0], help="how far to go (default: exam)")
+    add(
+        "--budget",
+        type=_seconds,
+        default=60.0,
+        metavar="T",
+        help="time for all of it, as 90, 120s or 2m (default: 60s)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
-    parser.add_argument("--report", metavar="FILE.html", help="also write a page (extra plot)")
+    add("--seed", type=int, default=0, metavar="N", help="of every draw (default: 0)")
+    add("--report", metavar="HTML", help="also write a page (extra plot)")
     add_trust(parser)
     return parser
 

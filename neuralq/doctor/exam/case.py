@@ -14,7 +14,7 @@ from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
 
-__all__ = ["CannotMeasure", "Case", "Measurement", "begin", "stacked"]
+__all__ = ["CannotMeasure", "Case", "begin", "stacked"]
 
 NUM_GREEDY, NUM_EXPLORED, NUM_OTHER = 100, 30, 30
 _EPSILON = 0.1

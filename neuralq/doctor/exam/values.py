@@ -19,16 +19,16 @@ __all__ = ["better_actions", "bias", "generalisation", "has_learned", "rank", "r
 def has_learned(case: Case) -> Finding:
     """V1: the greedy return beside that of chance and of the best action played alone."""
     rng = case.rng(11)
-    own, random = (np.array([one.score for one in group]) for group in (case.greedy, case.chance))
+    own, chance = (np.array([one.score for one in group]) for group in (case.greedy, case.chance))
     low, high = _mean_bounds(own, rng)
     alone = {a: np.array([one.score for one in group]) for a, group in case.constant.items() if group}
     best = max(alone, key=lambda a: float(alone[a].mean()))
-    others = {"random": _mean_bounds(random, rng)[1], f"action {best} alone": _mean_bounds(alone[best], rng)[1]}
+    others = {"random": _mean_bounds(chance, rng)[1], f"action {best} alone": _mean_bounds(alone[best], rng)[1]}
     name = max(others, key=lambda key: others[key])
     learned = low > others[name]
     said = (
         f"{len(own)} greedy episodes return {own.mean():.4g} (from {low:.4g} to {high:.4g}), random ones "
-        f"{random.mean():.4g}, and action {best} alone {alone[best].mean():.4g}"
+        f"{chance.mean():.4g}, and action {best} alone {alone[best].mean():.4g}"
     )
     return Finding(
         "V1", "the policy is no better than none", "algorithm", "B", float(own.mean()), (low, high), others[name],
