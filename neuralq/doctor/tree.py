@@ -82,8 +82,8 @@ def _headline(flagged: Sequence[Finding], by_id: Mapping[str, Finding]) -> str:
     named = [one for one in flagged if one.grade in "AB"]
     if not named:
         if _is_well(by_id):
-            return "Healthy: the policy has learned, and its values are what it returns (if a better one exists, "
-                   "they do not say)."
+            learned = "the policy has learned, and its values are what it returns"
+            return f"Healthy: {learned} (if a better one exists, they do not say)."
         if "V1" in by_id and not by_id["V1"].flagged:
             return "Nothing was found: the policy has learned; whether its values are right could not be measured."
         return "Cannot tell: too little could be measured; see what was not, and why."
