@@ -17,6 +17,12 @@ from neuralq.runs.folder.run_folder import is_run_folder
 __all__ = ["doctor"]
 
 
+_SUBJECT = (
+    "a neuralq run folder; a zip of Stable-Baselines3 (DQN) or sb3-contrib (QR-DQN); a .cleanrl_model; a state dict "
+    "(.pth, .safetensors, .npz)"
+)
+
+
 def doctor(argv: list[str]) -> int:
     """Examine a subject; exit status 0 healthy, 1 a finding of grade A or B, 2 it cannot be loaded."""
     options = _parser().parse_args(argv)
@@ -51,13 +57,8 @@ def _parser() -> argparse.ArgumentParser:
         "neuralq doctor dqn_cartpole.zip --env CartPole-v1 --report doctor.html",
         "neuralq doctor weights.pth --net my_module:QNetwork --env my_package:MyEnv-v0 --gamma 0.99",
     )
-    parser.add_argument(
-        "subject",
-        help="a neuralq run folder; a zip of Stable-Baselines3 (DQN) or sb3-contrib (QR-DQN); a .cleanrl_model; a "
-        "state "
-        "dict (.pth, .safetensors, .npz)",
-    )
     add = parser.add_argument
+    add("subject", help=_SUBJECT)
     add("--env", metavar="ID", help="the environment, as 'ID' or 'module:ID'; of a run folder its own")
     add(
         "--net",
