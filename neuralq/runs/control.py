@@ -192,7 +192,7 @@ def _load_agent(run_dir: str | Path, best: bool | None) -> Agent:
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
         scale = config.reward_scale * (1.0 if seen is None else seen.reward_scale)
-        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen)
+        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen, Path(run_dir))
     finally:
         envs.close()
 

@@ -336,6 +336,7 @@ class Session:
                 "last_metrics": self._last_metrics(),
                 "longest_episode": self._longest,
             },
+            "layers": self.learner.engine.flat.layers,
             "learner": self.learner.state_dict(),
             "feed": {} if self.experience is None else self.experience.state_dict(),
             "stream": self.stream.state_dict(),
