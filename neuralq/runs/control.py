@@ -26,6 +26,7 @@ from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.recipe.build import (
     build_q,
     build_session,
@@ -187,7 +188,7 @@ def _load_agent(run_dir: str | Path, best: bool | None) -> Agent:
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
         scale = config.reward_scale * (1.0 if seen is None else seen.reward_scale)
-        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen)
+        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen, Path(run_dir))
     finally:
         envs.close()
 
@@ -265,7 +266,8 @@ def last_cap(run_dir: str | Path) -> int:
 
 def _opening(config: RunConfig, session: Session) -> list[str]:
     warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
-    return [*opening_lines(session.stream), *warned]
+    told = [session.stream.told] if isinstance(session.stream, Playback) else []
+    return [*told, *opening_lines(session.stream), *warned]
 
 
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:

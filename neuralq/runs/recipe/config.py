@@ -102,6 +102,8 @@ class RunConfig:
         engine: "auto", "torch" or "compiled".
         device: "cpu", "cuda", "cuda:1", ….
         threads: CPU threads for linear algebra; small networks are fastest on one.
+        dataset: recorded experience to learn from in place of steps in the environment, "minari:ID" or a file.npz; with
+            the replay learner. A step of the budget is then what updates would follow.
         warm_start: run folder with whose weights, and statistics of observations, the run begins; None for new ones.
     """
 
@@ -141,6 +143,7 @@ class RunConfig:
     engine: str = "auto"
     device: str = "cpu"
     threads: int = 1
+    dataset: str | None = None
     warm_start: str | None = None
 
     def __post_init__(self) -> None:
@@ -182,6 +185,7 @@ class RunConfig:
         self.kind.check(self.settings, self)
         _check_exploration(self)
         _check_game(self)
+        _check_dataset(self)
 
     @property
     def kind(self) -> LearnerKind:
@@ -253,6 +257,17 @@ def _check_exploration(config: RunConfig) -> None:
             raise ValueError(
                 f"{name} would be ignored with the policy {plan['policy']!r}; leave it out, or act ε-greedily"
             )
+
+
+def _check_dataset(config: RunConfig) -> None:
+    if config.dataset is None:
+        return
+    if config.kind.experience != "replay":
+        raise ValueError(f"the {config.learner} learner takes no recorded experience; use learner='replay'")
+    if config.clip_rewards or config.end_on_life_loss:
+        raise ValueError(
+            "recorded rewards and episodes are taken as they are; leave clip_rewards and end_on_life_loss out"
+        )
 
 
 def _check_game(config: RunConfig) -> None:
