@@ -121,8 +121,8 @@ class LearnerKind:
         layout: of the representation where none is chosen.
         place: where it stands in lists; those of one number by name.
         step_sizes: settings that a run may go on with otherwise than it began.
-        on_table: ``on_table(given)``: defaults of settings over a table, where a sample moves one entry, and a step that
-            suits the weights of a network is much too small; left out where a step size is given.
+        on_table: ``on_table(given)``: defaults of settings over a table, where a sample moves one entry, so that a step
+            that suits the weights of a network is much too small; left out where a step size is given.
     """
 
     name: str
