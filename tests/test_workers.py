@@ -50,8 +50,8 @@ class Slow(gym.Env):
         self.count += 1
         if self.how == "wait":
             time.sleep(self.seconds)
-        until = time.perf_counter() + self.seconds
-        while self.how == "compute" and time.perf_counter() < until:
+        until = time.process_time() + self.seconds
+        while self.how == "compute" and time.process_time() < until:
             pass
         if self.fault == "raise" and self.count == 5:
             raise Odd(1, 2)
@@ -193,19 +193,19 @@ def test_no_process_outlives_the_run(how: signal.Signals, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["wait", "compute"])
 def test_slow_environments_step_at_once(how: str, folder: Path) -> None:
-    """Five milliseconds a step, two environments: 1.8 times as fast, by waiting on any machine, by computing on two."""
-    if how == "compute" and len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("needs two cores")
+    """Five milliseconds a step, eight environments: 1.8 times as fast by wall time, on two cores where they compute."""
+    if how == "compute" and (len(os.sched_getaffinity(0)) < 2 or os.getloadavg()[0] > 1):
+        pytest.skip("needs two cores that have nothing else to do")
     rates = {}
     for vectorization in ("sync", "async"):
         envs = make_envs(
-            RunConfig(env="slow_env:Slow", env_kwargs={"seconds": 0.005, "how": how}, vectorization=vectorization), 2
+            RunConfig(env="slow_env:Slow", env_kwargs={"seconds": 0.005, "how": how}, vectorization=vectorization), 8
         )
         stream = Interaction(envs, 0.9, 0)
         began = time.perf_counter()
-        for _ in range(200):
+        for _ in range(50):
             stream.step(lambda s: (s.new_zeros(len(s)).long(), s.new_ones(len(s))))
-        rates[vectorization] = 200 / (time.perf_counter() - began)
+        rates[vectorization] = 50 / (time.perf_counter() - began)
         envs.close()
     print(f"{how}: {rates['async'] / rates['sync']:.2f} times as fast")
     assert rates["async"] > 1.8 * rates["sync"]
