@@ -322,3 +322,10 @@ def test_the_readme_is_short_and_names_both_commands() -> None:
     assert len(text.splitlines()) < 200
     assert "make demo" in text
     assert "make test" in text
+
+
+def test_no_two_test_files_register_one_environment() -> None:
+    """Files share a process, and Gymnasium warns of the second, which is an error here."""
+    files = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("*.py")}
+    found = [name for text in files.values() for name in set(re.findall(r"\bregister\(\s*f?\"([^\"]+)\"", text))]
+    assert len(found) > 20 and sorted(found) == sorted(set(found))

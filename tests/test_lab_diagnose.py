@@ -364,3 +364,10 @@ def test_an_error_that_dies_out_through_ever_new_pieces_has_converged(name: str)
     assert found.verdict == "converges"
     assert 0.98 < found.spectral_radius < 1
     assert "halves every" in found.explain()
+
+
+def test_what_is_as_far_as_the_bound_is_not_poor() -> None:
+    assert not is_poor(10.0, 1.0, 0.0, 1.0) and is_poor(10.001, 1.0, 0.0, 1.0)  # POOR times the best
+    assert not is_poor(0.0, 0.0, 0.0, 0.5) and not is_poor(1e-6, 0.0, 1.0, 0.5) and is_poor(1.1e-6, 0.0, 1.0, 0.5)
+    assert not is_poor(1.15, 1.0, 0.0, 0.5) and is_poor(1.16, 1.0, 0.0, 0.5)  # 1/√.75 = 1.1547
+    assert not any(is_poor(*args, 0.5) for args in ((None, 0.0, 0.0), (1.0, None, 0.0), (1.0, 0.0, None)))

@@ -62,6 +62,7 @@ class Run:
         resumability: how exactly it can be resumed, in words.
         engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
         stopped_by: which hook ended it before its budget was spent, and why; None if none did.
+        dataset: from which recorded experience it learned; its steps are then those of the budget.
         agent: which parameters `neuralq.load` takes where nothing is said: "final" or "best".
         play_off: of a run that ended below its best evaluation, what that was decided by
             (`neuralq.runs.evaluation.play_off`); else None.
@@ -81,6 +82,7 @@ class Run:
     resumability: str
     engine: str
     stopped_by: str | None = None
+    dataset: str | None = None
     agent: str = "final"
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
@@ -94,11 +96,12 @@ class Run:
         """The same for people."""
         unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
         score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        counted = "environment steps" if self.dataset is None else f"steps of the budget on {self.dataset}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
         )
         lines = [
-            f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
+            f"{self.env_steps:,} {counted}, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}",
             *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
@@ -124,6 +127,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         resumability=session.resumability.reason if progress.moved is None else f"{NOT_EXACT}: {progress.moved}",
         engine=engine_name(session.learner),
         stopped_by=progress.stopped_by,
+        dataset=config.dataset,
         agent=agent,
         play_off=play_off,
         exact=exact,

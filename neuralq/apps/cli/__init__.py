@@ -19,7 +19,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from neuralq.apps.cli.numbers import joined, number, whole_number
-from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
+from neuralq.apps.cli.terminal import (
+    descriptor_of_its_own,
+    end_without_waiting,
+    listening,
+    make_standard_streams_safe,
+)
 from neuralq.checks import ELSEWHERE
 
 __all__ = [
@@ -222,12 +227,11 @@ def _present_folder() -> Iterator[None]:
 @contextlib.contextmanager
 def _own_output(as_json: bool) -> Iterator[None]:
     """With ``--json`` nothing but the result gets onto standard output; what else is printed goes beside it."""
-    token = _output.set(sys.stdout)
-    with contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout):
-        try:
-            yield
-        finally:
-            _output.reset(token)
+    with contextlib.ExitStack() as stack:
+        token = _output.set(stack.enter_context(descriptor_of_its_own()) if as_json else sys.stdout)
+        stack.callback(_output.reset, token)
+        stack.enter_context(contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout))
+        yield
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -237,8 +241,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = _main(argv)
         if heard and status == 0:
             print("neuralq: interrupted", file=sys.stderr)
-            return 130
-        return status
+            status = 130
+    if argv is None:  # the process ends with this command
+        end_without_waiting(status)
+    return status
 
 
 def _main(argv: Sequence[str] | None) -> int:

@@ -5,6 +5,7 @@ Environments, bodies and hooks are somebody's own code: where that raised, its f
 
 from __future__ import annotations
 
+import re
 import site
 import sys
 import sysconfig
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
+import torch
 
 import neuralq
 import neuralq_envs
@@ -56,12 +58,27 @@ def explained(error: BaseException) -> list[str] | None:
         >>> explained(ValueError("gamma must lie in [0, 1]"))
         ['gamma must lie in [0, 1]']
     """
+    error = _in_words(error)
     own = own_frame(error)
     if own is None or own.filename in str(error):
         return [str(error) or type(error).__name__] if isinstance(error, USER_FAULTS) else None
     told = str(error) if isinstance(error, USER_FAULTS) else f"{type(error).__name__}: {error}"
     line = f"    {own.line}" if own.line else ""
     return [told, f"  in {own.filename}, line {own.lineno}, {own.name}{line} (--debug shows the whole traceback)"]
+
+
+def _in_words(error: BaseException) -> BaseException:
+    """The same error, or one in words where torch was refused memory and says so in its own."""
+    asked = re.search(r"allocate (?:memory: you tried to allocate )?([\d.]+ \w+)", str(error))
+    refused = isinstance(error, torch.OutOfMemoryError) or "DefaultCPUAllocator" in str(error)
+    if not refused or not isinstance(error, RuntimeError):
+        return error
+    told = MemoryError(
+        f"torch was refused {'memory' if asked is None else asked[1] + ' of memory'}; take a smaller network, smaller "
+        "batches or fewer environments at a time"
+    )
+    told.__cause__ = error
+    return told
 
 
 def own_frame(error: BaseException) -> traceback.FrameSummary | None:

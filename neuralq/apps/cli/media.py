@@ -19,6 +19,7 @@ from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.control import last_cap
 from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.kinds import same_folder
 from neuralq.runs.offline.files import write_recorded
 from neuralq.runs.offline.minari_files import write_minari
 from neuralq.runs.offline.recording import record_steps
@@ -94,14 +95,16 @@ def _record_pictures(options: argparse.Namespace) -> int:
         raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
     path = single_run(options.run, options.trust)
     config = config_from_dict(read_config(path))
-    agent = load(path, options.best)
-    _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
-    env = make_shown(config, "rgb_array")
-    try:
-        rate = options.fps or frame_rate(env)
-        returns = _film(env, play(env, agent, options.episodes, options.seed, _limit(options, config)), rate, options)
-    finally:
-        env.close()
+    with same_folder() as here:  # environments may change it
+        agent, limit = load(here / path, options.best), _limit(options, config)
+        _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
+        env = make_shown(config, "rgb_array")
+        try:
+            rate = options.fps or frame_rate(env)
+            game = play(env, agent, options.episodes, options.seed, limit)
+            returns = _film(env, game, rate, options, here)
+        finally:
+            env.close()
     files = [Path(name) for name in (options.gif, options.mp4) if name is not None]
     plain = {
         "returns": returns,
@@ -123,17 +126,18 @@ def _record_steps(options: argparse.Namespace) -> int:
         raise Failure("--epsilon must lie in [0, 1], and --to be a file.npz", 2)
     path = single_run(options.run, options.trust)
     config = config_from_dict(read_config(path))
-    agent = load(path, options.best)
-    with refusals_name(config.env):
-        env = make_one(config)
-    try:
-        data = record_steps(env, agent, options.episodes, epsilon, options.seed, _limit(options, config))
-        if options.to is not None:
-            write_recorded(options.to, data)
-        else:
-            write_minari(options.minari, data, env, f"neuralq {config.learner}, ε = {epsilon:g}")
-    finally:
-        env.close()
+    with same_folder() as here:  # environments may change it
+        agent, limit = load(here / path, options.best), _limit(options, config)
+        with refusals_name(config.env):
+            env = make_one(config)
+        try:
+            data = record_steps(env, agent, options.episodes, epsilon, options.seed, limit)
+            if options.to is not None:
+                write_recorded(str(here / options.to), data)
+            else:
+                write_minari(options.minari, data, env, f"neuralq {config.learner}, ε = {epsilon:g}")
+        finally:
+            env.close()
     name = options.to or f"minari:{options.minari}"
     counts = {"num_steps": len(data.actions), "num_episodes": data.num_episodes, "epsilon": epsilon}
     told = f"{name}: {counts['num_steps']:,} steps in {data.num_episodes:,} episodes, ε = {epsilon:g}"
@@ -203,8 +207,9 @@ def _has_display() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
 
 
-def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Namespace) -> list[float]:
-    writers = writers_for(options.gif, options.mp4, rate)
+def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Namespace, here: Path) -> list[float]:
+    gif, mp4 = (name and str(here / name) for name in (options.gif, options.mp4))
+    writers = writers_for(gif, mp4, rate)
     returns: list[float] = []
     try:
         with ProgressBar[tuple[int, str]](options.episodes, lambda report: Told(report[0], report[1:])) as bar:

@@ -49,7 +49,8 @@ def train(argv: list[str]) -> int:
     with claimed(options.run_dir, lambda: CONTROL.default_path(config)) as path:
         refuse_old_run(path)  # also by the run, but preparing takes seconds
         origin = started_from(config, options)
-        probed = "; for a second it is tried how exactly the environment can be resumed" if config.resume_probe else ""
+        is_probed = config.resume_probe and config.dataset is None
+        probed = "; for a second it is tried how exactly the environment can be resumed" if is_probed else ""
         say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
         with _hooks(path, config, options.tensorboard, options.wandb, options.hooks) as hooks:
             run = CONTROL.train(config, path, hooks)
