@@ -164,9 +164,6 @@ class RunConfig:
         check_choice("learner", self.learner, LEARNERS)
         object.__setattr__(self, "layout", layout_for(self.learner, self.layout))
         check_choice("layout", self.layout, LAYOUTS)
-        check_choice("vectorization", self.vectorization, ("sync", "async"))
-        check_whole("frame_stack", self.frame_stack)
-        check_wrappers(self.wrappers)
         check_choice("engine", self.engine, ("auto", "torch", "compiled"))
         check_discount("gamma", self.gamma)
         check_positive("reward_scale", self.reward_scale)
@@ -194,7 +191,7 @@ class RunConfig:
         _check_outputs(self)
         self.kind.check(self.settings, self)
         _check_exploration(self)
-        _check_game(self)
+        _check_environment(self)
         _check_dataset(self)
 
     @property
@@ -280,7 +277,10 @@ def _check_dataset(config: RunConfig) -> None:
         )
 
 
-def _check_game(config: RunConfig) -> None:
+def _check_environment(config: RunConfig) -> None:
+    check_choice("vectorization", config.vectorization, ("sync", "async"))
+    check_whole("frame_stack", config.frame_stack)
+    check_wrappers(config.wrappers)
     for name, way_out in (("clip_rewards", "use reward_scale"), ("end_on_life_loss", "leave it out")):
         if getattr(config, name) and not is_screen(config.env, config.env_kwargs):
             raise ValueError(f"{name} is for the screens of Atari games (ALE/...), got {config.env!r}; {way_out}")

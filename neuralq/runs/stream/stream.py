@@ -288,8 +288,6 @@ class Interaction:
             found = reward if isinstance(reward, np.ndarray) else np.array(reward)
             for one in found.flat if found.dtype.kind in "OSU" else ():
                 as_number(one)
-            if np.asarray(reward).dtype.kind in "USO":  # text of a number is none
-                raise TypeError
             r_t = np.array(reward, np.float64)
         except (TypeError, ValueError) as error:
             raise self._fault(f"field reward: must be numbers, got {reward!r}") from error
