@@ -67,6 +67,7 @@ COMMANDS = {
     "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),
     "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
     "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),
+    "doctor": _of("doctor", "doctor", "why a value function is bad, of a run or a file of another library", _LOOK),
     "lab": _of("lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page", _KNOW),
     "baird": _of("demo", "baird", "predict divergence on Baird's star, then measure it", _KNOW),
     "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),
