@@ -180,7 +180,7 @@ class RunConfig:
         for name, kind in LEARNERS.items():
             given = getattr(self, name)
             if name == self.learner and given is None:
-                object.__setattr__(self, name, kind.settings())
+                object.__setattr__(self, name, kind.settings_for(self.layout, {}))
             elif name != self.learner and given is not None:
                 raise ValueError(
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
@@ -325,7 +325,8 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     _refuse_unknown("the configuration", values, RunConfig)
     for name, kind in LEARNERS.items():
         if values.get(name) is not None:
-            values[name] = kind.settings(**_fitted(name, values[name], kind.settings))
+            layout = layout_for(name, values.get("layout", RunConfig.layout))
+            values[name] = kind.settings_for(layout, _fitted(name, values[name], kind.settings))
     if values.get("body") is not None:
         body = _body_of(values["body"])
         check_choice("class of the body", body.get("class"), BODIES)
