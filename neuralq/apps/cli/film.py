@@ -20,7 +20,8 @@ from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.folder.files import replacing
 from neuralq.runs.loop import seed_for
-from neuralq.runs.recipe.games import make_single, refusals_name
+from neuralq.runs.recipe.environments import make_one
+from neuralq.runs.recipe.games import refusals_name
 from neuralq.runs.stream import faults_of, legal_actions
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def make_shown(config: RunConfig, mode: str) -> gym.Env[Any, Any]:
     """
     with refusals_name(config.env):
         try:
-            return make_single(config.env, config.env_kwargs, mode)
+            return make_one(config, mode)
         except gym.error.DependencyNotInstalled as error:
             missing = error
     raise MissingExtra(f"{config.env} cannot be drawn ({missing}); {_INSTALL}") from missing
