@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from neuralq import rules as rules
     from neuralq import runs as recipes
     from neuralq import tabular as tabular
+    from neuralq.apps.filming import record as record
     from neuralq.learners.replay.buffer import ReplayBuffer as ReplayBuffer
     from neuralq.mdp import FiniteMDP as FiniteMDP
     from neuralq.q import ActionInputQ as ActionInputQ
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from neuralq.q import TableQ as TableQ
     from neuralq.runs import Run as Run
     from neuralq.runs import RunConfig as RunConfig
+    from neuralq.runs import evaluate as evaluate
+    from neuralq.runs import export as export
     from neuralq.runs import load as load
     from neuralq.runs import report as report
     from neuralq.runs import resume as resume
@@ -48,12 +51,15 @@ __all__ = [
     "TableQ",
     "Transition",
     "__version__",
+    "evaluate",
     "exact",
+    "export",
     "lab",
     "learners",
     "load",
     "q",
     "recipes",
+    "record",
     "report",
     "resume",
     "rules",
@@ -77,7 +83,10 @@ _HOMES = {
     "SeparateQ": "neuralq.q",
     "TableQ": "neuralq.q",
     "Transition": "neuralq.types",
+    "evaluate": "neuralq.runs",
+    "export": "neuralq.runs",
     "load": "neuralq.runs",
+    "record": "neuralq.apps.filming",
     "resume": "neuralq.runs",
     "solve": "neuralq.runs",
     "train": "neuralq.runs",
@@ -108,7 +117,9 @@ if not TYPE_CHECKING:  # a type checker would believe that every name exists
             except ModuleNotFoundError as error:
                 if error.name != module:  # it exists, but something that it needs does not
                     raise
-        raise AttributeError(f"module 'neuralq' has no attribute {name!r}; its public names are {', '.join(__all__)}")
+        instead = None if name.startswith("_") else import_module("neuralq.apps.elsewhere").instead_of(name)
+        hint = f"its public names are {', '.join(__all__)}" if instead is None else f"there is {instead}"
+        raise AttributeError(f"module 'neuralq' has no attribute {name!r}; {hint}")
 
 
 def __dir__() -> list[str]:

@@ -36,6 +36,8 @@ import neuralq
 from neuralq.runs import RunConfig, evaluate_run, with_preset
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.presets import PRESETS
+from neuralq.runs.recipe.replay_presets import ANY
 from neuralq.runs.sweep.statistics import bootstrap_interval, estimate, interquartile_mean
 
 _WIDE = {"policy_kwargs": {"net_arch": [256, 256]}}
@@ -90,7 +92,9 @@ def _train_ours(env: str, learner: str, seed: int, total_steps: int, num_episode
 
 def configured(learner: str, given: dict[str, Any]) -> RunConfig:
     """With the environment's preset, or what an environment without one gets."""
-    return with_preset(given) if learner == "preset" else config_from_dict({**cut_to_budget({}, given)[0], **given})
+    if learner == "preset":
+        return with_preset(given)
+    return config_from_dict({**cut_to_budget(PRESETS[ANY, "replay"], given)[0], **given})
 
 
 def _train_sb3(env: str, learner: str, seed: int, total_steps: int, num_episodes: int) -> tuple[float, float]:

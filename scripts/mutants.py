@@ -29,7 +29,7 @@ import tempfile
 import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from hashlib import sha256
@@ -60,8 +60,8 @@ ROOMS = {
 EQUIVALENT = ROOT / "scripts" / "equivalent_mutants.toml"
 MARK = 0.95  # of the mutants that compute something else
 MOST_SECONDS = 120.0  # that the tests of one mutant may take
-SHOWN = ("frozen", "slots", "repr", "eq", "compare")  # how a record is shown and kept, not what it computes
-LIMIT = 240.0  # seconds, on a machine that others use, until they are stopped
+SHOWN = ("frozen", "slots", "repr", "eq", "compare", "place")  # how a record is shown and kept, not what it computes
+LIMIT = 240.0  # seconds until they are stopped; a test alone: 20 and five times what it takes, more where it compiles
 OPERATORS = [
     f"core/{operator}"
     for operator in (
@@ -242,10 +242,17 @@ def control(parent: str, kept: Path | None, workers: int) -> tuple[Seen, str]:
 
 
 class Chosen:
-    """A plugin of pytest: leaves out all tests but these, and keeps what failed."""
+    """A plugin of pytest: leaves out all tests but these, keeps what failed, and ends the process with one that hangs.
 
-    def __init__(self, tests: Iterable[str]) -> None:
-        self._tests, self.failed = set(tests), ""
+    Args:
+        tests: each with the seconds that it may take.
+    """
+
+    def __init__(self, tests: dict[str, float]) -> None:
+        self._tests, self.failed = tests, ""
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        signal.setitimer(signal.ITIMER_REAL, self._tests[nodeid])
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         items[:] = [item for item in items if item.nodeid in self._tests]
@@ -259,12 +266,17 @@ class Chosen:
             self.failed = report.nodeid
 
 
-def tried(tests: list[str], limit: float) -> tuple[str, str]:
-    """How a child of this process fares with the tests, and the first that failed."""
+def tried(tests: dict[str, float]) -> tuple[str, str]:
+    """How a child of this process fares with the tests, and the first that failed.
+
+    Args:
+        tests: each with the seconds that it may take.
+    """
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         os.setsid()
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         nothing = os.open(os.devnull, os.O_RDWR)
         for descriptor in (0, 1, 2):
             os.dup2(nothing, descriptor)
@@ -277,20 +289,20 @@ def tried(tests: list[str], limit: float) -> tuple[str, str]:
             os.write(writer, chosen.failed.encode())
             os._exit(status)
     os.close(writer)
-    ended = end_of(child, limit)
+    ended = end_of(child)
     os.set_blocking(reader, False)
     with open(reader, "rb", buffering=0) as said:
         failed = (said.read() or b"").decode()
-    if ended is None:
+    if ended in (None, -signal.SIGALRM):
         return "timed out", ""
     if ended == 0:
         return "survived", ""
     return ("killed" if failed or ended < 0 else "broken"), failed or f"pytest ended with {ended}"
 
 
-def end_of(child: int, limit: float) -> int | None:
+def end_of(child: int) -> int | None:
     """The exit status of a child that leads its session, negative if a signal ended it; None where time was up."""
-    deadline, ended = time.monotonic() + limit, None
+    deadline, ended = time.monotonic() + LIMIT, None
     while ended is None and time.monotonic() < deadline:
         found, status = os.waitpid(child, os.WNOHANG)
         ended = os.waitstatus_to_exitcode(status) if found else None
@@ -305,25 +317,26 @@ def end_of(child: int, limit: float) -> int | None:
 _SOUND: dict[str, str] = {}  # what became of a test alone, on sound code
 
 
-def outcome_of(mutant: Mutant, tests: list[str]) -> tuple[str, str]:
-    """Whether these tests noticed, and which; run in a copy."""
+def outcome_of(mutant: Mutant, tests: dict[str, float]) -> tuple[str, str]:
+    """Whether these tests, given with the seconds that they take, noticed, and which; run in a copy."""
     path = Path(mutant.file)
     source = path.read_text(encoding="utf-8")
     mutated = MutationVisitor.mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
     with tempfile.TemporaryDirectory() as kernels:
         # A kernel that calls a changed one in another file would come from the cache as it was before.
         os.environ.pop("NUMBA_CACHE_DIR", None)
-        if "from neuralq.jit" in source:
+        compiles = "from neuralq.jit" in source
+        if compiles:
             os.environ["NUMBA_CACHE_DIR"] = kernels
         path.write_text(mutated, encoding="utf-8")
         try:
-            outcome, failed = tried(tests, LIMIT)
+            outcome, failed = tried({test: (80 if compiles else 20) + 5 * taken for test, taken in tests.items()})
         finally:
             path.write_text(source, encoding="utf-8")
             os.environ.pop("NUMBA_CACHE_DIR", None)
     if outcome == "killed" and "::" in failed:
         if failed not in _SOUND:
-            _SOUND[failed] = tried([failed], LIMIT)[0]
+            _SOUND[failed] = tried({failed: LIMIT})[0]
         if _SOUND[failed] != "survived":
             return "broken", f"{failed} fails alone on sound code"
     return outcome, failed
@@ -368,9 +381,9 @@ def run(
                 mutant = next(mutants, None)
                 if mutant is None:
                     break
-                pending[pool.submit(outcome_of, mutant, tests_of(mutant.file, mutant.line, seen, MOST_SECONDS))] = (
-                    mutant
-                )
+                tests = tests_of(mutant.file, mutant.line, seen, MOST_SECONDS)
+                times = {test: seen[test]["seconds"] for test in tests}
+                pending[pool.submit(outcome_of, mutant, times)] = mutant
             if not pending:
                 return results
             for future in wait(pending, timeout=5, return_when=FIRST_COMPLETED).done:

@@ -69,8 +69,10 @@ def pytest_sessionfinish() -> None:
 @cache
 def importers(file: str) -> tuple[str, ...]:
     """The library's files that import a file."""
-    module = re.escape(file.removesuffix(".py").replace("/", "."))
-    wanted = re.compile(rf"^\s*from {module} import|^\s*import {module}\b", re.MULTILINE)
+    module = file.removesuffix(".py").replace("/", ".")
+    package, _, name = map(re.escape, module.rpartition("."))
+    both = rf"from {package} import (?:[^(\n]*|\([^)]*)\b{name}\b"
+    wanted = re.compile(rf"^\s*(?:from {re.escape(module)} import|import {re.escape(module)}\b|{both})", re.MULTILINE)
     files = (str(p.relative_to(ROOT)) for p in sorted((ROOT / "neuralq").rglob("*.py")))
     return tuple(file for file in files if wanted.search((ROOT / file).read_text(encoding="utf-8")))
 

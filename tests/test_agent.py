@@ -118,7 +118,7 @@ def test_an_agent_is_the_network_of_the_newest_checkpoint(cartpole: Path) -> Non
 
 def test_an_observation_of_another_shape_is_refused(cartpole: Path) -> None:
     agent = neuralq.load(cartpole)
-    for observation in (np.zeros(3, np.float32), np.zeros((1, 4), np.float32), np.full(4, np.nan, np.float32)):
+    for observation in (np.zeros(3, np.float32), np.zeros((1, 1, 4), np.float32), np.full(4, np.nan, np.float32)):
         with pytest.raises(ValueError):
             agent.predict(observation)
 
@@ -142,3 +142,47 @@ def test_folders_that_hold_no_run_are_one_clear_error(cartpole: Path, tmp_path: 
         (bare / name).write_bytes((cartpole / name).read_bytes())
     with pytest.raises(CheckpointError, match="no checkpoint in"):
         neuralq.load(bare)
+
+
+def test_a_batch_is_its_rows(cartpole: Path) -> None:
+    agent, rows = neuralq.load(cartpole), np.random.default_rng(0).normal(size=(7, 4)).astype(np.float32)
+    values, actions = agent.values(rows), agent.predict(rows)
+    assert values.shape == (7, 2) and values.dtype == np.float64 and actions.dtype == np.int64
+    np.testing.assert_allclose(values, [agent.values(row) for row in rows], rtol=1e-5)
+    assert (
+        actions.tolist()
+        == [agent.predict(row) for row in rows]
+        == agent(rows).tolist()
+        == np.argmax(values, 1).tolist()
+    )
+    assert agent(rows[0]) == actions[0] and agent.predict(rows[:1]).shape == (1,)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_masks_of_a_batch(masked: bool, tmp_path: Path) -> None:
+    agent = neuralq.load(neuralq.train(bandit("table", masked), tmp_path / "run").run_dir)
+    states, legal = np.array([0, 1, 1, 0]), np.array([[1, 1, 1], [1, 1, 0], [1, 0, 0], [0, 1, 0]])
+    values = agent.values(states, legal)
+    assert np.array_equal(np.isfinite(values), legal == 1)
+    assert values[1] == pytest.approx(agent.values(1, [1, 1, 0]))
+    assert agent.predict(states, legal).tolist() == [7, 6, 5, 6]
+    assert agent.predict(states, action_mask=[1, 1, 0]).tolist() == [6, 6, 6, 6]  # one row stands for all
+    with pytest.raises(ValueError, match="3 entries, or 4 rows of them"):
+        agent.values(states, legal[:3])
+    with pytest.raises(ValueError, match=r"3 entries, got shape \(4, 3\)"):
+        agent.values(0, legal)
+
+
+def test_what_other_libraries_write_is_told_what_to_write(cartpole: Path) -> None:
+    agent, observation = neuralq.load(cartpole), np.zeros(4, np.float32)
+    with pytest.raises(TypeError, match=r"takes no deterministic; .*: action = agent\.predict\(observation\)"):
+        agent.predict(observation, deterministic=True)
+    with pytest.raises(TypeError, match=r"nothing beside it: action = agent\.predict\(observation\)"):
+        _, _ = agent.predict(observation)
+    env = gym.make("CartPole-v1")
+    env.reset(seed=0)
+    env.step(agent.predict(observation))  # and is a number all the same
+    env.close()
+    with pytest.raises(AttributeError, match=r"no 'learn'; a run goes on with neuralq\.resume"):
+        agent.learn(1000)
+    assert not hasattr(agent, "anything_else")

@@ -50,11 +50,11 @@ class Corridor(gym.Env[Any, Any]):
         return self.s, self._factor * reward, ends, False, {}
 
 
-gym.register("test/Corridor-v0", Corridor)
+gym.register("test/Hallway-v0", Corridor)
 
 Q_STAR = [[4.0, 1.0], [8.0, 1.0]]  # γ = ½; state 2 begins no episode and is entered by none
 CONFIG = RunConfig(
-    env="test/Corridor-v0", layout="table", learner="online", gamma=0.5, total_steps=64, evaluate_every=32,
+    env="test/Hallway-v0", layout="table", learner="online", gamma=0.5, total_steps=64, evaluate_every=32,
     evaluation_episodes=2, log_every=64, checkpoint_every=32, epsilon_end=1.0, online=OnlineSettings(step_size=0.5),
 )  # fmt: skip
 
@@ -131,7 +131,7 @@ def test_large_models_are_solved_only_when_asked(monkeypatch: pytest.MonkeyPatch
     assert beside(Corridor(), asked=True).compare(table(*Q_STAR, [0.0, 0.0]), 1.0) is not None
 
 
-@pytest.mark.parametrize("env", ["test/Corridor-v0", "neuralq/MitchellGrid-v0"])
+@pytest.mark.parametrize("env", ["test/Hallway-v0", "neuralq/MitchellGrid-v0"])
 def test_the_run_tells_it_and_is_the_same_without(tmp_path: Path, env: str) -> None:
     config = dataclasses.replace(CONFIG, env=env)
     run = train(config, tmp_path / "with")
@@ -140,7 +140,7 @@ def test_the_run_tells_it_and_is_the_same_without(tmp_path: Path, env: str) -> N
     rows = [row for row in read_metrics(tmp_path / "with") if row["kind"] == "evaluation"]
     assert all(row["regret"] >= 0 and row["q_error_max"] <= row["q_error_max_all"] for row in rows[:1]) and rows
     assert run.exact is not None and run.exact == read_json(tmp_path / "with" / "summary.json")["exact"]
-    assert (tmp_path / "with" / "exact.json").exists() == (env != "test/Corridor-v0")
+    assert (tmp_path / "with" / "exact.json").exists() == (env != "test/Hallway-v0")
     again = evaluate_run(tmp_path / "with", 2)
     assert again.exact is not None and again.exact.plain() == run.exact
     assert evaluate_run(tmp_path / "without", 2).exact is None

@@ -18,7 +18,7 @@ from neuralq.apps.cli import main
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP
 from neuralq.runs import RunConfig, evaluate_run, load, resume, train
-from neuralq.runs.folder.checkpoint import load_newest
+from neuralq.runs.folder.checkpoint import CheckpointError, load_newest
 from neuralq.runs.folder.run_folder import read_changes, read_config, read_metrics, read_summary
 
 Capture = pytest.CaptureFixture[str]
@@ -59,6 +59,12 @@ def test_a_step_size_is_used_from_where_it_was_changed_and_kept(tmp_path: Path, 
     (row,) = read_changes(path)
     assert row["env_steps"] == 64 and row["changes"] == {f"{learner}.{field}": [old, 1e-30], "total_steps": [64, 128]}
     assert read_summary(path)["changes"] == [row]
+    config_file = path / "config.json"
+    kept = config_file.read_text()
+    config_file.write_text(kept.replace("1e-30", "2e-30"))
+    with pytest.raises(CheckpointError, match="is of another configuration"):  # nobody asked for that one
+        resume(path, 192)
+    config_file.write_text(kept)
     resume(path, 192, **{NAMES[learner]: old})
     assert not torch.equal(parameters(path), before)
     assert evaluate_run(path, 1, best=True).returns and load(path).predict([-0.5, 0.0]) in (0, 1, 2)

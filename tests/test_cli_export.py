@@ -18,10 +18,12 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from neuralq.apps.cli import export as export_module
 from neuralq.apps.cli import main
 from neuralq.runs import RunConfig, load
 from neuralq.runs.agent import Agent
+from neuralq.runs.exporting import export as export_module
+from neuralq.runs.exporting import onnx_file
+from neuralq.runs.exporting.played import played
 from neuralq.runs.recipe.build import build_q
 from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.stream import Interaction, Normalisation
@@ -115,14 +117,13 @@ def test_dueling_streams_of_a_distribution(tmp_path: Path, capsys: Capture) -> N
 
 def test_a_file_that_differs_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     run, file = trained(tmp_path / "run", "CartPole-v1"), tmp_path / "policy.onnx"
-    played = export_module._played
 
     def shifted(*given: Any) -> Any:
-        observations, values = played(*given)
-        values[200, 1] += 1e-3
-        return observations, values
+        found = played(*given)
+        found.values[200, 1] += 1e-3
+        return found
 
-    monkeypatch.setattr(export_module, "_played", shifted)
+    monkeypatch.setattr(export_module, "played", shifted)
     assert main(["export", run, "--onnx", str(file)]) == 1
     assert "differs from the run's by 0.001" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
@@ -131,13 +132,13 @@ def test_a_file_that_differs_is_not_kept(tmp_path: Path, monkeypatch: pytest.Mon
 def test_greedy_actions_are_compared_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     run = trained(tmp_path / "run", "test/Offset-v0")
 
-    forward = export_module.ExportedNetwork.forward
+    forward = onnx_file.ExportedNetwork.forward
 
     def worst(self: Any, *inputs: Any) -> Any:
         values, _ = forward(self, *inputs)
         return values, values.argmin(-1) + self.first_action
 
-    monkeypatch.setattr(export_module.ExportedNetwork, "forward", worst)
+    monkeypatch.setattr(onnx_file.ExportedNetwork, "forward", worst)
     assert main(["export", run, "--onnx", str(tmp_path / "policy.onnx")]) == 1
     assert "differs from the run's by inf" in capsys.readouterr().err
 
@@ -245,8 +246,7 @@ def test_the_file_takes_what_the_environment_gives(
     which: str, layout: str, normalised: bool, masked: bool, tmp_path: Path
 ) -> None:
     config, agent = untrained(which, masked, layout, normalised)
-    inputs, expected = export_module._played(config, agent)
-    export_module._write_checked(agent, config, tmp_path / "policy.onnx", inputs, expected)
+    onnx_file.write_onnx(agent, config, tmp_path / "policy.onnx", played(config, agent))
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     names = ["speed", "gear", "arm.0", "arm.1"] if which == "dict" else ["observation"]
     assert [one.name for one in session.get_inputs()] == [*names, *(["action_mask"] if masked else [])]

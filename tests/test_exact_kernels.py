@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse
 
-from neuralq.exact import asynchronous_kernels, kernels
+from neuralq.exact import asynchronous_kernels, kernels, sweeping
 from neuralq.exact.asynchronous_kernels import greedy_trials, predecessors, process_queue, settle
 from neuralq.exact.problem import prepare, rows_of
 from neuralq.mdp import FiniteMDP
@@ -258,4 +258,20 @@ def test_the_problem_of_a_model() -> None:
     mass = DECAY * DENSE[:, ~MDP.is_terminal].sum(axis=1)
     assert (problem.reach, problem.least_modulus) == (1 / (1 - mass.max()), mass.min())
     assert problem.longest == np.diff(MDP.transition.indptr).max() and problem.largest_reward == 9.0
+    down, up = problem.least_modulus / (1 - problem.least_modulus), problem.reach - 1
+    assert problem.interval(-1.0, 2.0) == (-up, 2 * up) and problem.interval(1.0, 2.0) == (down, 2 * up)
+    assert problem.interval(-2.0, -1.0) == (-2 * up, -down) and problem.interval(0.0, 0.0) == (0.0, 0.0)
+    endless = prepare(FiniteMDP.from_arrays([[[1.0]]], [[0.0]]), 1.0)  # V = T V leaves no error there either
+    assert endless.reach == np.inf and endless.interval(0.0, 0.0) == (0.0, 0.0)
     assert problem.rounding(V) == (problem.longest + 4) * 2.0**-52 * (9 + 4)
+
+
+def test_the_copy_of_the_rows_that_are_left_is_a_model_of_its_own() -> None:
+    for slack in (0.0, 0.5):
+        left, values = sweeping._surviving(ROWS, V, slack), np.array(row_values(V))
+        num_rows, num_entries = kernels.survivors(ROWS, values, slack)
+        assert [len(x) for x in left] == [9, num_rows + 1, num_entries, num_entries, num_rows, num_rows]
+        assert (left.starts[-1], left.indptr[-1]) == (num_rows, num_entries) and not left.reward.flags.writeable
+        better, all_better = np.empty(8), np.empty(8)
+        assert kernels.sweep(left, V, better, np.inf) == kernels.sweep(ROWS, V, all_better, np.inf)
+        assert better.tolist() == all_better.tolist()

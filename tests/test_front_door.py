@@ -54,19 +54,18 @@ def config_of(env: Any, preset: bool = True, **settings: Any) -> RunConfig:
 
 
 def test_keyword_arguments_are_fields_and_the_settings_of_the_learner() -> None:
-    config = config_of(
-        "Unknown-v0", learner="replay", lambda_=0.0, total_steps=1e5, gamma=0.9, batch_size=8, hidden=[4]
-    )
+    given = {"learner": "replay", "lambda_": 0.0, "total_steps": 1e5, "gamma": 0.9, "batch_size": 8, "hidden": [4]}
+    config = config_of("Unknown-v0", False, **given)
     assert (config.learner, config.total_steps, config.gamma, config.body) == ("replay", 100_000, 0.9, MLP((4,)))
     assert config.replay == ReplaySettings(lambda_=0.0, batch_size=8)
-    same = config_of({"env": "Unknown-v0", "learner": "replay", "replay": {"batch_size": 8}}, lambda_=0.0, gamma=0.9)
+    nested = {"env": "Unknown-v0", "learner": "replay", "replay": {"batch_size": 8}}
+    same = config_of(nested, False, lambda_=0.0, gamma=0.9)
     assert same.replay == config.replay
     whole = config_of(config, seed=3, batch_size=9)
     assert whole.seed == 3 and whole.replay == ReplaySettings(lambda_=0.0, batch_size=9) and whole.body == config.body
     assert config_of(config, learner="online").online is not None  # settings of another learner go with it
-    assert (
-        config_of("X-v0", body=MLP((3,)), learner="replay", replay=ReplaySettings(batch_size=7)).replay.batch_size == 7
-    )  # type: ignore[union-attr]
+    parts = config_of("X-v0", body=MLP((3,)), learner="replay", replay=ReplaySettings(batch_size=7))
+    assert parts.body == MLP((3,)) and parts.settings.batch_size == 7
 
 
 def test_a_preset_is_the_default_as_from_the_shell_and_is_said(

@@ -149,6 +149,9 @@ def is_interface(node: ast.ClassDef) -> bool:
     return bool(bases & {"Protocol", "ABC", "Enum", "NamedTuple"}) or any(b.endswith(("Error", "tion")) for b in bases)
 
 
+AUDITED = ("neuralq/doctor/weights.py", "torch.load")
+"""The one place that may read a ``.pth``, with weights_only=True: `test_doctor_loading` attacks it."""
+
 RULES: list[Rule] = [
     *(long_functions, merged_end_facts, vague_classes, squeezes_without_axis),
     *(pickles, global_draws, implementation_bases),
@@ -180,6 +183,7 @@ def test_the_library_keeps_the_rule(rule: Rule) -> None:
         f"{path.relative_to(ROOT)}:{line}: {message}"
         for path in LIBRARY
         for line, message in rule(ast.parse(path.read_text(encoding="utf-8")))
+        if (path.relative_to(ROOT).as_posix(), message) != AUDITED
     ]
     assert not offences, "\n" + "\n".join(offences)
 
@@ -200,9 +204,10 @@ def test_files_are_short_and_their_names_say_something() -> None:
 LOOSE_FILES = {
     *("__init__.py", "__main__.py", "py.typed"),
     *("types.py", "checks.py", "jit.py", "figures.py"),
-    "backgammon.py",  # a public name: what it re-exports lives in systems/
+    "backgammon.py",
+    "dqn.py",  # a public name: what it re-exports lives in systems/
 }
-ROOMS = {"apps", "lab", "systems", "runs", "learners", "q", "tabular", "exact", "rules", "mdp"}
+ROOMS = {"apps", "doctor", "lab", "systems", "runs", "learners", "q", "tabular", "exact", "rules", "mdp"}
 
 
 def test_the_top_of_the_package_shows_the_rooms_and_little_else() -> None:
@@ -321,3 +326,10 @@ def test_the_readme_is_short_and_names_both_commands() -> None:
     assert len(text.splitlines()) < 200
     assert "make demo" in text
     assert "make test" in text
+
+
+def test_no_two_test_files_register_one_environment() -> None:
+    """Files share a process, and Gymnasium warns of the second, which is an error here."""
+    files = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("*.py")}
+    found = [name for text in files.values() for name in set(re.findall(r"\bregister\(\s*f?\"([^\"]+)\"", text))]
+    assert len(found) > 20 and sorted(found) == sorted(set(found))

@@ -391,3 +391,12 @@ def test_dqrc_and_linear_functions_refuse_illegal_actions_too() -> None:
     one = torch.ones(1, dtype=F64)
     with pytest.raises(ValueError, match="action 1 is illegal"):
         learner.update(Transition(s, torch.tensor([1]), one, one, one, s, one < 0))
+
+
+def test_numbers_of_target_rules_are_those_of_their_papers_where_nobody_names_others() -> None:
+    # QRC: β = 1 and one rate for both functions (Patterson et al. 2022). Munchausen: .03, .9, −1 (Vieillard et al.).
+    given = {rule: ReplaySettings(target_rule=rule, learning_rate=0.25).options for rule in ("dqrc", "munchausen")}
+    assert given["dqrc"] == {"dqrc_beta": 1.0, "dqrc_learning_rate": 0.25}
+    assert given["munchausen"] == {"temperature": 0.03, "munchausen_alpha": 0.9, "munchausen_floor": -1.0}
+    for rule in ("retrace", "tree_backup", "harutyunyan"):
+        assert ReplaySettings(target_rule=rule, block_length=8).options == {"target_epsilon": 0.05}

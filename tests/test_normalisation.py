@@ -222,3 +222,17 @@ class Late(Counter):
         _, info = super().reset(seed=seed)
         self.t, self.index = self.index % 3, 0
         return np.full(1, self.t - 7.0, np.float32), info
+
+
+def test_one_sum_divides_nothing_and_the_state_is_one_number_of_each_kind() -> None:
+    seen = Normalisation((3,), 0.5, 2)
+    assert seen.reward_scale == 1.0
+    assert seen.reward(np.array([4.0, 6.0]), np.zeros(2, bool), np.array([True, False])).tolist() == pytest.approx(
+        [4, 6]
+    )
+    assert seen.reward_scale == 1.0  # exactly: one sum has no spread
+    seen.reward(np.array([8.0, 0.0]), np.zeros(2, bool), np.array([True, False]))  # 4, then 2 + 8: a variance of 18
+    assert seen.reward_scale == pytest.approx(18**-0.5)
+    shapes = {name: value.shape for name, value in seen.state_dict().items()}
+    assert shapes["observation_mean"] == shapes["observation_squares"] == (3,) and shapes["returns"] == (2,)
+    assert {shapes[name] for name in shapes.keys() - {"observation_mean", "observation_squares", "returns"}} == {(1,)}

@@ -16,7 +16,8 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from neuralq.runs.stream import EnvironmentFault, Interaction, interact
+from neuralq.runs.stream import EnvironmentFault, Episode, Interaction, Step, interact
+from neuralq.runs.stream.early_returns import EarlyReturns
 from neuralq.runs.stream.vector_env import make_vector_env
 
 
@@ -194,3 +195,38 @@ def test_numbers_of_every_kind_are_rewards(monkeypatch: pytest.MonkeyPatch) -> N
         with monkeypatch.context() as patched:
             patched.setattr(stream.envs, "step", lambda actions, found=found: found)
             assert stream.step(lambda s: push(s, np.random.default_rng(0))).rows[3].tolist() == [1.0, 2.0]
+
+
+def early(low: float, high: float, said: list[str], num_envs: int = 2) -> EarlyReturns:
+    return EarlyReturns(low, high, 0.5, num_envs, said.append)
+
+
+def one_step(rewards: list[float], moved: list[int], ended: tuple[int, ...] = ()) -> Step:
+    fields = tuple(np.array(rewards) if i == 3 else np.zeros(len(moved)) for i in range(7))
+    return Step(fields, np.array(moved), tuple(Episode(i, 0.0, 1) for i in ended))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "outside"), [(2.0, 9.0, False), (-9.0, 2.0, False), (2.1, 9.0, True), (-9.0, 1.9, True)]
+)
+def test_a_discounted_return_outside_of_what_is_represented_is_told_once(
+    low: float, high: float, outside: bool
+) -> None:
+    said: list[str] = []
+    watch = early(low, high, said)
+    # Environment 1 earns 8, then 1 + ½ · 2 = 2 in an episode of its own; 0 does not end.
+    assert early(-9.0, 9.0, said).add(one_step([7.0, 8.0], [0, 1], (1,))) is not None
+    assert watch.add(one_step([5.0, 1.0], [0, 1])) is watch
+    assert watch.add(one_step([2.0], [1], (1,))) is (None if outside else watch)
+    assert [f"a discounted return of 2 lies outside of {low:g}..{high:g}"] * outside == [
+        text.split(",")[0] for text in said
+    ]
+
+
+def test_the_next_episode_begins_anew_and_after_a_thousand_steps_nobody_watches() -> None:
+    said: list[str] = []
+    watch = early(1.0, 1.0, said)  # a return of 1 is all that there is
+    for k in range(499):
+        assert watch.add(one_step([1.0, 1.0], [0, 1], (0, 1))) is watch and not said, k
+    assert watch.add(one_step([1.0], [1], (1,))) is watch  # 999 steps of environments
+    assert watch.add(one_step([1.0], [0], (0,))) is None and not said

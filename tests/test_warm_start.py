@@ -40,7 +40,7 @@ def configuration(**given: Any) -> RunConfig:
 
 
 def replay(rate: float = 5e-4, **given: Any) -> RunConfig:
-    settings = ReplaySettings(learning_starts=20, batch_size=8, learning_rate=rate, target_period_updates=10)
+    settings = ReplaySettings(learning_starts=20, batch_size=8, learning_rate=rate, target_period_updates=500)
     return configuration(learner="replay", replay=settings, **given)
 
 
@@ -49,12 +49,23 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return train(replay(seed=1), tmp_path_factory.mktemp("source") / "run")
 
 
+class First:
+    """Keeps the values before anything was learned."""
+
+    values: Any = None
+
+    def on_step(self, session: Any) -> None:
+        if self.values is None:
+            self.values = session.values(S)
+
+
 @pytest.mark.parametrize("learner", ["replay", "rollout, averaged"])
 def test_a_run_begins_with_the_weights_of_another_in_every_copy(source: Run, tmp_path: Path, learner: str) -> None:
     settings = RolloutSettings(num_envs=2, num_steps=8, learning_rate=NOTHING, optimiser="sgd", average_updates=4.0)
     config = replay(NOTHING) if learner == "replay" else configuration(rollout=settings)
     path = tmp_path / "run"
-    run = neuralq.train(config, path, warm_start=source)
+    run = neuralq.train(config, path, [first := First()], warm_start=source)
+    assert np.array_equal(first.values, load(source).values(S))
     assert np.array_equal(load(path).values(S), load(source).values(S))
     kept = read_config(path)["warm_start"]
     assert kept == f"{source.run_dir}@sha256:{source.parameters_sha256}" and run.parameters_sha256 == kept[-64:]

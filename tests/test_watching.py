@@ -239,12 +239,17 @@ def test_runs_of_other_kinds_say_what_they_do_not_show(tmp_path: Path, caplog: p
         def on_step(self, session: Any) -> None:
             raise AssertionError
 
+        def on_evaluation(self, session: Any) -> None:
+            session.stop("enough games")
+
         def on_end(self, session: Any) -> None:
-            assert session.amount == 3 and session.metrics
+            assert session.amount == 2 and session.metrics and session.ended_by.endswith("Looking: enough games")
             with pytest.raises(ValueError, match="show no action values to hooks"):
                 session.values(0)
 
-    config = TdGammonConfig(SelfPlaySettings(num_games=3, num_hidden=10), evaluate_against=())
+    settings = SelfPlaySettings(num_games=4, num_hidden=10)
+    config = TdGammonConfig(settings, evaluate_against=("random",), evaluate_every=2, evaluation_games=2)
     with caplog.at_level(logging.WARNING, "neuralq"):
-        train_games(config, tmp_path / "run", [Looking()])
+        run = train_games(config, tmp_path / "run", [Looking()])
+    assert run.games == 2 and run.stopped_by is not None and run.stopped_by.endswith("Looking: enough games")
     assert "is never called: a run of this kind tells of no single ones" in caplog.text

@@ -170,6 +170,17 @@ class MlpEngine:
         q = self._loss_gradient(self._rows(s)[0], a.reshape(-1).numpy(), None, None, (kernels.VALUE, 1.0))
         return torch.from_numpy(q)[0]
 
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``."""
+        x = self._rows(s)[0]
+        if c.shape != (len(x), self._num_actions):
+            raise ValueError(f"coefficients must be one for each action of {len(x)} states, got {tuple(c.shape)}")
+        actions = np.tile(np.arange(self._num_actions), len(x))
+        each = np.repeat(x, self._num_actions, axis=0)
+        self._reserve(len(each))
+        weights = np.ascontiguousarray(c.to(self._dtype).numpy()).reshape(-1)
+        self._loss_gradient(each, actions, None, weights, (kernels.VALUE, 1.0))
+
     def _check_legal(self, s: Tensor, a: Tensor, weight: Tensor | None = None) -> None:
         if self._mask is not None:
             check_actions(a, self._num_actions)

@@ -66,6 +66,10 @@ class QuantileQ(nn.Module):
         """What is expected of an action with these outputs: ``[*n, K] -> [*n]``."""
         return outputs.mean(-1)
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
         return self.mean(self.outputs(s))
@@ -130,6 +134,10 @@ class CategoricalQ(nn.Module):
     def mean(self, outputs: Tensor) -> Tensor:
         """What is expected of an action with these logits: ``[*n, K] -> [*n]``."""
         return (torch.softmax(outputs, -1) * self.support).sum(-1)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from neuralq.checks import check_whole
 from neuralq.q.bodies import ACTIVATIONS, MLP, GroupedLayerNorm
 from neuralq.q.custom import Body
+from neuralq.q.inputs import shape_of
 from neuralq.q.layouts import ActionOutputQ
 
 __all__ = ["DuelingQ"]
@@ -63,6 +64,7 @@ class DuelingQ(nn.Module):
         num_atoms: int = 1,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         check_whole("num_atoms", num_atoms)
         body, rng = body or MLP(), np.random.default_rng(rng)
@@ -83,6 +85,10 @@ class DuelingQ(nn.Module):
         stream = dataclasses.replace(body, hidden=(last,))
         self.value = stream.trunk(width, num_atoms, 1, rng, dtype)
         self.advantage = stream.trunk(width, self.num_actions, 1, rng, dtype)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``, or ``[*n, A·K]``."""

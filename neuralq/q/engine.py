@@ -64,6 +64,13 @@ class Engine(Protocol):
         """Q(s, a) ``[]`` of one state and action; leaves its gradient in ``flat.grad``."""
         ...
 
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``.
+
+        Coefficients of illegal actions must be 0.
+        """
+        ...
+
     def sync_target(self, rate: float = 1.0) -> None:
         """Move the target copy (made at the first call) by this share of the way to the parameters: 1 copies them."""
         ...
@@ -122,6 +129,11 @@ class TorchEngine:
         q = self._legal_at(s, a)
         q.backward()  # type: ignore[no-untyped-call]
         return q.detach()
+
+    def sum_gradient(self, s: Tensor, c: Tensor) -> None:
+        """Leaves the gradient of Σ c·Q(s, ·), for coefficients ``[B, A]`` of states ``[B, *obs]``, in ``flat.grad``."""
+        self.flat.grad.zero_()
+        torch.where(c == 0, 0.0, self.q.all(s) * c).sum().backward()  # type: ignore[no-untyped-call]
 
     def network(self, target: bool = False) -> QFunction:
         """The module itself, or its target copy, for learners that need more of it than action values."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +17,8 @@ class FlatParameters:
     Optimisers, traces, target copies, step bounds and checkpoints are then expressions on one vector. Autograd
     accumulates into the same memory, because it adds in place to a gradient that is already there.
 
-    ``grad_array`` is the memory of ``grad`` as an array, None on other devices than the CPU.
+    ``grad_array`` is the memory of ``grad`` as an array, None on other devices than the CPU. ``layers`` tells where a
+    parameter lies, by the name that ``module.state_dict()`` has for it: first entry and shape.
 
     Args:
         module: its parameters (in the order of ``module.parameters()``) are moved; they must share dtype and device.
@@ -28,6 +30,8 @@ class FlatParameters:
         >>> flat.values[:] = torch.arange(4.0)
         >>> q.all(torch.tensor(1)).tolist()
         [2.0, 3.0]
+        >>> flat.layers
+        {'weight': [0, [2, 2]]}
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -43,12 +47,14 @@ class FlatParameters:
         self.grad = torch.zeros_like(self.values)
         on_cpu = first.device.type == "cpu"
         self.grad_array = self.grad.numpy() if on_cpu else None
+        self.layers: dict[str, list[Any]] = {}
         start = 0
-        for p in parameters:
+        for name, p in module.named_parameters():
             end = start + p.numel()
             self.values[start:end] = p.detach().reshape(-1)
             p.data = self.values[start:end].view(p.shape)
             p.grad = self.grad[start:end].view(p.shape)
+            self.layers[name] = [start, list(p.shape)]
             start = end
 
     def offset(self, parameter: Tensor) -> int:

@@ -160,6 +160,10 @@ class ImplicitQuantileQ(nn.Module):
         """What is expected of an action with these quantiles, at evenly spread or drawn levels: ``[*n, K] -> [*n]``."""
         return outputs.mean(-1)
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
         return self.mean(self.outputs(s))

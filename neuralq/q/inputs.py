@@ -34,7 +34,8 @@ def shape_of(given: Any) -> tuple[int, ...]:
     if any(side < 1 for side in found):
         raise ValueError(
             f"input_shape must be the length of a vector or a tuple of whole numbers of at least 1, got {given!r}; a "
-            "Gymnasium Box has it as its shape, and a Discrete goes to TableQ(space.n, num_actions)"
+            "Gymnasium Box has it as its shape (and a Discrete the number of actions as its n); states go to "
+            "TableQ(space.n, num_actions)"
         )
     return found
 

@@ -85,11 +85,16 @@ class ActionOutputQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, num_actions, 1, rng, dtype)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
@@ -123,11 +128,16 @@ class SeparateQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, num_actions, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features, 1, num_actions, rng, dtype)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``."""
@@ -162,12 +172,17 @@ class ActionInputQ(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
+        input_shape = shape_of(input_shape)
         check_whole("num_actions", num_actions)
         body, rng = body or MLP(), np.random.default_rng(rng)
         self.num_actions = num_actions
         self.input = _Input(input_shape, body, 1, features, rng, dtype)
         self.trunk = body.trunk(self.input.num_features + num_actions, 1, 1, rng, dtype)
         self.register_buffer("one_hot", torch.eye(num_actions, dtype=dtype), persistent=False)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, *obs] -> [*n, A]``, each state paired with every action at once."""

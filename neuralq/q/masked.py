@@ -54,6 +54,10 @@ class MaskedQ(nn.Module):
         """Which actions are not legal: ``[*n, d + A] -> [*n, A]`` bool."""
         return s[..., self.width :] == 0
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values, −∞ where illegal: ``[*n, d + A] -> [*n, A]``."""
         return self.inner.all(self.observation(s)).masked_fill(self.illegal(s), -torch.inf)

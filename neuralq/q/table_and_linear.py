@@ -32,6 +32,10 @@ class TableQ(nn.Module):
         self.num_actions = num_actions
         self.weight = nn.Parameter(torch.zeros(num_states, num_actions, dtype=dtype))
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n] int64 -> [*n, A]``."""
         return self.weight[s]
@@ -81,6 +85,10 @@ class LinearQ(nn.Module):
         if x.shape[-1:] != (num_features,):
             raise ValueError(f"this function takes {num_features} features, got observations of shape {tuple(x.shape)}")
         return x.to(self.weight.dtype)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for, traced and compiled."""
+        return self.all(s)
 
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, d] -> [*n, A]``."""

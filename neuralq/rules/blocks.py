@@ -100,6 +100,7 @@ RETRACE = TargetRule(
     options=_epsilon("retrace"),
     blocks=True,
     place=12,
+    behaviour=True,
 )
 TREE_BACKUP = TargetRule(
     name="tree_backup",

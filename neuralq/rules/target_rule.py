@@ -131,6 +131,7 @@ class TargetRule:
             on a grid) and "num_steps" (above 1). ``{distribution!r}`` and ``{num_steps}`` stand for what was given.
             A rule that follows nothing refuses distributions by itself.
         place: where it stands in lists; those of one number by name.
+        behaviour: whether it needs the probabilities with which actions were taken.
 
     Example:
         >>> from neuralq.rules.one_step import DOUBLE
@@ -148,6 +149,7 @@ class TargetRule:
     correction: str = ""
     refuses: Mapping[str, str] = field(default_factory=dict)
     place: int = 100
+    behaviour: bool = False
 
     def __post_init__(self) -> None:
         """A rule says what it follows, or what its means are and, by that, that it refuses whole distributions."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,32 @@ from neuralq.types import Array, QFunction
 
 __all__ = ["Agent"]
 
+_ALONE = "predict returns the greedy action and nothing beside it: action = agent.predict(observation)"
+_ELSEWHERE = {
+    "learn": "a run goes on with neuralq.resume(run, total_steps=...)",
+    "save": "the run folder holds it, and neuralq.load(run) takes it from there; neuralq.export(run, 'q.safetensors') "
+    "writes a plain torch network",
+    "load": "neuralq.load(run) makes an agent of a run folder",
+    "policy": "the network is agent.q, and agent.predict(observation) its greedy action",
+    "q_net": "the network is agent.q",
+    "evaluate": "neuralq.evaluate(agent) plays greedy episodes",
+    "act": "the greedy action is agent.predict(observation)",
+    "forward": "the greedy action is agent.predict(observation), action values are agent.values(observation)",
+}
+"""What other libraries' agents have, and what there is instead."""
+
+
+class _Action(int):
+    """A number of an action, which is no pair: two names on the left of it are two too many."""
+
+    def __iter__(self) -> Any:
+        raise TypeError(_ALONE)
+
 
 class Agent:
-    """Acts greedily and tells what it expects.
+    """Acts greedily and tells what it expects, of one observation or of a batch.
+
+    ``agent(observations)`` is `predict`.
 
     Args:
         q: the representation.
@@ -25,6 +49,7 @@ class Agent:
         first_action: smallest action of the environment (0 unless its space starts elsewhere).
         reward_scale: by which rewards were multiplied for learning; values are given in the environment's units.
         normalisation: through which observations were seen, frozen.
+        run_dir: folder of the run that it comes from, if it comes from one.
     """
 
     def __init__(
@@ -35,6 +60,7 @@ class Agent:
         first_action: int = 0,
         reward_scale: float = 1.0,
         normalisation: Normalisation | None = None,
+        run_dir: Path | None = None,
     ) -> None:
         self.q = q
         self.encoder = encoder
@@ -42,39 +68,78 @@ class Agent:
         self.first_action = first_action
         self.reward_scale = reward_scale
         self.normalisation = normalisation
+        self.run_dir = run_dir
 
-    def values(self, observation: Any, action_mask: Any = None) -> Array:
-        """Action values of one observation, in units of the environment's return.
-
-        Args:
-            observation: as the environment gives it, not batched.
-            action_mask: which actions are legal ``[A]``; all of them where it is left out.
-
-        Returns:
-            ``[A]`` float64, −∞ for illegal actions.
+    def __getattr__(self, name: str) -> Any:
+        """Only asked for what there is not.
 
         Raises:
-            ValueError: if the observation or the mask is not what the environment's spaces promise.
+            AttributeError: always; of what agents of other libraries have it says what there is instead.
         """
-        mask = np.ones(self.spec.num_actions, bool) if action_mask is None else np.asarray(action_mask) != 0
-        if mask.shape != (self.spec.num_actions,):
-            raise ValueError(f"action_mask must have {self.spec.num_actions} entries, got shape {mask.shape}")
-        encoded = np.asarray(self.encoder.encode_single(observation))[None]
-        if self.normalisation is not None:
-            encoded = self.normalisation.observe(encoded)
-        if self.spec.masked:
-            flat = np.concatenate([encoded.reshape(1, -1), mask.reshape(1, -1)], axis=1)
-            encoded = flat.astype(self.spec.dtype)
-        device = next(iter(self.q.parameters())).device  # type: ignore[attr-defined]
-        with torch.no_grad():
-            q = self.q.all(torch.from_numpy(encoded).to(device))[0]
-        values = q.cpu().numpy().astype(np.float64) / self.reward_scale
-        return np.where(mask, values, -np.inf)
+        hint = f"; {_ELSEWHERE[name]}" if name in _ELSEWHERE else ""
+        raise AttributeError(f"an agent has no {name!r}{hint}", name=name, obj=self)
 
-    def predict(self, observation: Any, action_mask: Any = None) -> int:
-        """The greedy action for one observation, ready for ``env.step``.
+    def inputs(self, observations: Any, action_mask: Any = None) -> Array:
+        """What ``agent.q`` is given for observations, a row for each: ``[n, *spec.shape]``, one row for a single one.
 
         Arguments and errors as for `values`.
         """
-        action, _ = choose_greedy(torch.from_numpy(self.values(observation, action_mask)[None]))
-        return int(action[0]) + self.first_action
+        single = not self.encoder.is_batch(observations)
+        encoded = self.encoder.encode_single(observations)[None] if single else self.encoder.encode(observations)
+        if self.normalisation is not None:
+            encoded = self.normalisation.observe(encoded)
+        if self.spec.masked:
+            mask = self._mask(action_mask, len(encoded), single)
+            flat = np.concatenate([encoded.reshape(len(encoded), -1), mask], axis=1)
+            encoded = flat.astype(self.spec.dtype)
+        return encoded
+
+    def _mask(self, given: Any, num_rows: int, single: bool) -> Array:
+        """Which actions are legal, ``[n, A]``; one row may stand for all."""
+        num_actions = self.spec.num_actions
+        mask = np.ones(num_actions, bool) if given is None else np.asarray(given) != 0
+        if mask.shape != (num_actions,) and (single or mask.shape != (num_rows, num_actions)):
+            many = "" if single else f", or {num_rows} rows of them"
+            raise ValueError(f"action_mask must have {num_actions} entries{many}, got shape {mask.shape}")
+        return np.broadcast_to(mask, (num_rows, num_actions))
+
+    def values(self, observations: Any, action_mask: Any = None) -> Array:
+        """Action values, in units of the environment's return.
+
+        Args:
+            observations: one, as the environment gives it; or n of them, as a vector environment gives them.
+            action_mask: which actions are legal, ``[A]``, or ``[n, A]``; all of them where it is left out.
+
+        Returns:
+            ``[A]`` float64, or ``[n, A]``; −∞ for illegal actions.
+
+        Raises:
+            ValueError: if an observation or the mask is not what the environment's spaces promise.
+        """
+        single, rows = not self.encoder.is_batch(observations), self.inputs(observations, action_mask)
+        device = next(iter(self.q.parameters())).device  # type: ignore[attr-defined]
+        with torch.no_grad():
+            q = self.q.all(torch.from_numpy(rows).to(device))
+        values = q.cpu().numpy().astype(np.float64) / self.reward_scale
+        values = np.where(self._mask(action_mask, len(rows), single), values, -np.inf)
+        return values[0] if single else values
+
+    def predict(self, observations: Any, action_mask: Any = None, **elsewhere: Any) -> Any:
+        """The greedy action, ready for ``env.step``: of one observation a whole number, of n ``[n]`` int64.
+
+        It is always greedy, and comes alone; ``deterministic`` and the second result of other libraries there are not.
+        Arguments and errors as for `values`.
+
+        Raises:
+            TypeError: for arguments of theirs, with what to write.
+        """
+        if elsewhere:
+            raise TypeError(f"predict takes no {next(iter(elsewhere))}; {_ALONE}")
+        values = self.values(observations, action_mask)
+        action, _ = choose_greedy(torch.from_numpy(values if values.ndim == 2 else values[None]))
+        chosen = action.numpy() + self.first_action
+        return chosen if values.ndim == 2 else _Action(chosen[0])
+
+    def __call__(self, observations: Any, action_mask: Any = None) -> Any:
+        """As `predict`."""
+        return self.predict(observations, action_mask)

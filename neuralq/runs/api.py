@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuralq.runs.control import CONTROL, Run
+from neuralq.runs.control import CONTROL, Run, evaluate_run
+from neuralq.runs.evaluation import Evaluation
 from neuralq.runs.kinds import kind_of
 from neuralq.runs.loop import Hook, Listener
 from neuralq.runs.recipe.config import RunConfig, config_from_dict
@@ -18,7 +21,7 @@ from neuralq.runs.recipe.presets import of_agent, started, with_preset
 from neuralq.runs.recipe.stand_in import Maker, standing_in
 from neuralq.runs.stop_request import pass_on
 
-__all__ = ["load", "resume", "train"]
+__all__ = ["environment_of", "evaluate", "folder_of", "load", "resume", "train"]
 
 _makers: dict[Path, Maker] = {}
 """What makes the environments of this process's runs that no name leads to, by run folder."""
@@ -101,15 +104,36 @@ def _tell(hooks: Sequence[Hook], line: str) -> None:
     logging.getLogger("neuralq").info(line)
 
 
-def _maker(run: Path, env: Any) -> Maker | None:
-    """What makes the environments of a run: what is handed over now, or was when it began in this process."""
-    if env is None:
-        return _makers.get(run.resolve())
-    handed = handed_over(env)
-    if handed.make is None:
-        config = RunConfig(env=handed.env, env_kwargs=handed.env_kwargs)
-        return lambda: make_single(config.env, config.env_kwargs)
-    return handed.make
+@contextlib.contextmanager
+def environment_of(run: Path, env: Any = None) -> Iterator[None]:
+    """Within the block environments of a run that no name leads to are found.
+
+    Args:
+        run: its folder.
+        env: what is handed over now, as for `train`; None for what was when the run began in this process.
+    """
+    make = _makers.get(run.resolve())
+    if env is not None:
+        handed = handed_over(env)
+        make = handed.make or functools.partial(make_single, handed.env, handed.env_kwargs)
+    with standing_in(make):
+        yield
+
+
+def folder_of(run: Any) -> Path:
+    """The folder of a run, by its path, by what training returned or by an agent.
+
+    Raises:
+        ValueError: for anything else.
+
+    Example:
+        >>> folder_of("runs/demo").name
+        'demo'
+    """
+    found = getattr(run, "run_dir", run)
+    if not isinstance(found, str | Path):
+        raise ValueError(f"a run is named by its folder, what training returned or a loaded agent, got {run!r}")
+    return Path(found)
 
 
 def resume(
@@ -143,21 +167,16 @@ def resume(
         ValueError: for a new budget of a run that does not count environment steps, one that is spent already, and for
             changes that would make another run of it.
     """
-    path = _folder(run_dir)
+    path = folder_of(run_dir)
     kind = kind_of(path)
     if total_steps is not None and kind.budget != "total_steps":
         raise ValueError(
             f"{path} is {kind.title}, whose budget is {kind.budget} and not total_steps; leave it out here, or "
             "resume the run as its system does"
         )
-    with standing_in(_maker(path, env)):
+    with environment_of(path, env):
         run = kind.resume(path, total_steps, hooks, changes)
     return _passed_on(run)
-
-
-def _folder(run: Any) -> Path:
-    """The folder of a run, by its path or by what training returned."""
-    return Path(getattr(run, "run_dir", run))
 
 
 def _passed_on(run: Any) -> Any:
@@ -187,6 +206,39 @@ def load(run_dir: str | Path | Run, best: bool | None = None, *, env: Any = None
         CheckpointError: if no checkpoint is intact.
         ValueError: if the best is asked for of a run that keeps its newest only.
     """
-    path = _folder(run_dir)
-    with standing_in(_maker(path, env)):
+    path = folder_of(run_dir)
+    with environment_of(path, env):
         return kind_of(path).load(path, best)
+
+
+def evaluate(
+    run: Any, num_episodes: int = 100, seed: int = 0, best: bool | None = None, *, env: Any = None
+) -> Evaluation:
+    """Returns of greedy episodes, played by the agent of a run in environments of their own.
+
+    Args:
+        run: a run, its folder, or an agent that was loaded from it.
+        num_episodes: how many episodes.
+        seed: of the episodes; unrelated to those seen in training.
+        best: which parameters, as for `load`.
+        env: as for `load`.
+
+    Raises:
+        ValueError: if ``run`` is none of these, or has learned no policy.
+        RunFolderError: if there is no run in the folder.
+
+    Example:
+        >>> import tempfile
+        >>> run = train("CartPole-v1", tempfile.mkdtemp() + "/run", total_steps=64, evaluation_episodes=1,
+        ...             num_envs=2, num_steps=16, hidden=(8,))
+        >>> len(evaluate(run, 5).returns)
+        5
+    """
+    if isinstance(num_episodes, bool) or not isinstance(num_episodes, int):
+        raise ValueError(
+            f"the second argument is how many episodes, got {num_episodes!r}; write neuralq.evaluate(run), or "
+            "neuralq.evaluate(run, env=...) for an environment that has no name"
+        )
+    path = folder_of(run)
+    with environment_of(path, env):
+        return evaluate_run(path, num_episodes, seed, best)

@@ -26,6 +26,7 @@ from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.recipe.build import (
     build_q,
     build_session,
@@ -62,6 +63,7 @@ class Run:
         resumability: how exactly it can be resumed, in words.
         engine: what computed values and gradients: "compiled" kernels, "torch", or both, each what it can.
         stopped_by: which hook ended it before its budget was spent, and why; None if none did.
+        dataset: from which recorded experience it learned; its steps are then those of the budget.
         agent: which parameters `neuralq.load` takes where nothing is said: "final" or "best".
         play_off: of a run that ended below its best evaluation, what that was decided by
             (`neuralq.runs.evaluation.play_off`); else None.
@@ -82,6 +84,7 @@ class Run:
     resumability: str
     engine: str
     stopped_by: str | None = None
+    dataset: str | None = None
     agent: str = "final"
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
@@ -96,11 +99,12 @@ class Run:
         """The same for people."""
         unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
         score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        counted = "environment steps" if self.dataset is None else f"steps of the budget on {self.dataset}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
         )
         lines = [
-            f"{self.env_steps:,} environment steps, {self.cpu_seconds:.2f} CPU-seconds of training, "
+            f"{self.env_steps:,} {counted}, {self.cpu_seconds:.2f} CPU-seconds of training, "
             f"{self.wall_seconds:.2f} seconds in all; {score}",
             *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
@@ -130,6 +134,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         resumability=session.resumability.reason if progress.moved is None else f"{NOT_EXACT}: {progress.moved}",
         engine=engine_name(session.learner),
         stopped_by=progress.stopped_by,
+        dataset=config.dataset,
         agent=agent,
         play_off=play_off,
         exact=exact,
@@ -195,7 +200,7 @@ def _load_agent(run_dir: str | Path, best: bool | None) -> Agent:
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
         _, first_action = discrete_actions(envs.single_action_space)
         scale = config.reward_scale * (1.0 if seen is None else seen.reward_scale)
-        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen)
+        return Agent(q, stream.encoder, stream.spec, first_action, scale, seen, Path(run_dir))
     finally:
         envs.close()
 
@@ -273,7 +278,8 @@ def last_cap(run_dir: str | Path) -> int:
 
 def _opening(config: RunConfig, session: Session) -> list[str]:
     warned = [f"warning: {line}" for line in warnings_ahead(config, session.stream)]
-    return [*opening_lines(session.stream), *warned]
+    told = [session.stream.told] if isinstance(session.stream, Playback) else []
+    return [*told, *opening_lines(session.stream), *warned]
 
 
 def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:

@@ -137,6 +137,7 @@ class Kind(Generic[C, T, R]):
             ):
                 _end_if_asked(request)
                 config = self.start(config, trainee)
+                torch.set_num_threads(self.num_threads(config))  # whatever environments asked for when they were made
                 with RunFolder.create(here / path, config=self.to_plain(config), seed=seed) as folder:
                     folder.named = path
                     folder.free = self.free
@@ -162,6 +163,7 @@ class Kind(Generic[C, T, R]):
             contextlib.closing(self.build(config)) as trainee,
         ):
             _end_if_asked(request)
+            torch.set_num_threads(self.num_threads(config))
             folder.free, folder.named = self.free, Path(run_dir)
             if not any(folder.checkpoints_path.glob("step-*")):
                 self.start(config, trainee)

@@ -23,6 +23,7 @@ from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
@@ -56,7 +57,7 @@ class Session:
         beside: holds what is learned against the exact answer, where the environment has a model.
     """
 
-    stream: Interaction | TableWalk
+    stream: Interaction | TableWalk | Playback
     policy: Policy | None
     experience: ExperienceSource | None
     learner: Learner
@@ -335,6 +336,7 @@ class Session:
                 "last_metrics": self._last_metrics(),
                 "longest_episode": self._longest,
             },
+            "layers": self.learner.engine.flat.layers,
             "learner": self.learner.state_dict(),
             "feed": {} if self.experience is None else self.experience.state_dict(),
             "stream": self.stream.state_dict(),
@@ -347,7 +349,7 @@ class Session:
         """The environments' own state; None where it cannot be taken, or no longer can."""
         if not self.resumability.exact:
             return None
-        if isinstance(self.stream, TableWalk) and self.stream.simulated:
+        if isinstance(self.stream, TableWalk | Playback) and self.stream.simulated:
             return {}
         try:
             return encode_env(self.stream.envs)

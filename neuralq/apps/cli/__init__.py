@@ -19,7 +19,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from neuralq.apps.cli.numbers import joined, number, whole_number
-from neuralq.apps.cli.terminal import listening, make_standard_streams_safe
+from neuralq.apps.cli.terminal import (
+    descriptor_of_its_own,
+    end_without_waiting,
+    listening,
+    make_standard_streams_safe,
+)
 from neuralq.checks import ELSEWHERE
 
 __all__ = [
@@ -62,6 +67,7 @@ COMMANDS = {
     "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),
     "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
     "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),
+    "doctor": _of("doctor", "doctor", "why a value function is bad, of a run or a file of another library", _LOOK),
     "lab": _of("lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page", _KNOW),
     "baird": _of("demo", "baird", "predict divergence on Baird's star, then measure it", _KNOW),
     "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),
@@ -200,6 +206,8 @@ def _top(first: str) -> int:
         return 0
     close = difflib.get_close_matches(first, COMMANDS, 1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+    if re.search(r"-v\d+$", first):
+        hint = f"an environment goes with one, as in neuralq train {first}"
     print(f"neuralq: there is no command {first!r}; {hint} (neuralq --help)", file=sys.stderr)
     return 2
 
@@ -220,12 +228,11 @@ def _present_folder() -> Iterator[None]:
 @contextlib.contextmanager
 def _own_output(as_json: bool) -> Iterator[None]:
     """With ``--json`` nothing but the result gets onto standard output; what else is printed goes beside it."""
-    token = _output.set(sys.stdout)
-    with contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout):
-        try:
-            yield
-        finally:
-            _output.reset(token)
+    with contextlib.ExitStack() as stack:
+        token = _output.set(stack.enter_context(descriptor_of_its_own()) if as_json else sys.stdout)
+        stack.callback(_output.reset, token)
+        stack.enter_context(contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout))
+        yield
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -235,8 +242,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = _main(argv)
         if heard and status == 0:
             print("neuralq: interrupted", file=sys.stderr)
-            return 130
-        return status
+            status = 130
+    if argv is None:  # the process ends with this command
+        end_without_waiting(status)
+    return status
 
 
 def _main(argv: Sequence[str] | None) -> int:

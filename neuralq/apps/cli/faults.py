@@ -5,14 +5,16 @@ Environments, bodies and hooks are somebody's own code: where that raised, its f
 
 from __future__ import annotations
 
+import re
 import site
 import sys
 import sysconfig
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 import gymnasium as gym
+import torch
 
 import neuralq
 import neuralq_envs
@@ -56,12 +58,27 @@ def explained(error: BaseException) -> list[str] | None:
         >>> explained(ValueError("gamma must lie in [0, 1]"))
         ['gamma must lie in [0, 1]']
     """
+    error = _in_words(error)
     own = own_frame(error)
     if own is None or own.filename in str(error):
         return [str(error) or type(error).__name__] if isinstance(error, USER_FAULTS) else None
     told = str(error) if isinstance(error, USER_FAULTS) else f"{type(error).__name__}: {error}"
     line = f"    {own.line}" if own.line else ""
     return [told, f"  in {own.filename}, line {own.lineno}, {own.name}{line} (--debug shows the whole traceback)"]
+
+
+def _in_words(error: BaseException) -> BaseException:
+    """The same error, or one in words where torch was refused memory and says so in its own."""
+    asked = re.search(r"allocate (?:memory: you tried to allocate )?([\d.]+ \w+)", str(error))
+    refused = isinstance(error, torch.OutOfMemoryError) or "DefaultCPUAllocator" in str(error)
+    if not refused or not isinstance(error, RuntimeError):
+        return error
+    told = MemoryError(
+        f"torch was refused {'memory' if asked is None else asked[1] + ' of memory'}; take a smaller network, smaller "
+        "batches or fewer environments at a time"
+    )
+    told.__cause__ = error
+    return told
 
 
 def own_frame(error: BaseException) -> traceback.FrameSummary | None:
@@ -71,13 +88,18 @@ def own_frame(error: BaseException) -> traceback.FrameSummary | None:
     cause: BaseException | None = error
     while cause is not None and id(cause) not in seen:
         seen.add(id(cause))
-        found = _innermost_own(cause.__traceback__) or found
+        found = _innermost_own(_frames(cause)) or found
         cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
     return found
 
 
-def _innermost_own(trace: TracebackType | None) -> traceback.FrameSummary | None:
-    frames = traceback.extract_tb(trace)
+def _frames(error: BaseException) -> Sequence[traceback.FrameSummary]:
+    """Of an error, also of one in another process."""
+    remote: Sequence[traceback.FrameSummary] = getattr(error, "remote_frames", ())
+    return remote or traceback.extract_tb(error.__traceback__)
+
+
+def _innermost_own(frames: Sequence[traceback.FrameSummary]) -> traceback.FrameSummary | None:
     return next((frame for frame in reversed(frames) if _is_own(frame.filename)), None)
 
 

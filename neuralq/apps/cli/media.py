@@ -19,7 +19,12 @@ from neuralq.apps.cli.sweeps import add_trust, add_which, single_run
 from neuralq.runs import RunConfig, load
 from neuralq.runs.control import last_cap
 from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.kinds import same_folder
+from neuralq.runs.offline.files import write_recorded
+from neuralq.runs.offline.minari_files import write_minari
+from neuralq.runs.offline.recording import record_steps
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.environments import make_one
 from neuralq.runs.recipe.games import make_single, refusals_name
 
 __all__ = ["record", "watch"]
@@ -61,8 +66,10 @@ def record(argv: list[str]) -> int:
     """Film greedy episodes."""
     parser = command_parser(
         "record",
-        "Film a trained run; needs no display. Step, return and the largest action value stand below the picture.",
+        "Film a trained run; needs no display. Step, return and the largest action value stand below the picture. Or "
+        "record its steps as a data set, to learn from with neuralq train ENV --dataset.",
         "neuralq record RUN --gif run.gif",
+        "neuralq record RUN --to data.npz --episodes 100 --epsilon 0.2",
         "neuralq record RUN --mp4 run.mp4 --episodes 3 --best",
     )
     _add_options(parser, num_episodes=1)
@@ -70,19 +77,34 @@ def record(argv: list[str]) -> int:
     parser.add_argument("--mp4", metavar="FILE", help="write an MP4")
     parser.add_argument("--fps", type=float, metavar="X", help="steps per second (default: what the environment says)")
     parser.add_argument("--width", type=int, default=480, metavar="N", help="of the picture in pixels (default: 480)")
+    parser.add_argument("--to", metavar="FILE.npz", help="record the steps as arrays")
+    parser.add_argument("--minari", metavar="ID", help="record the steps as a data set of Minari's (extra minari)")
+    parser.add_argument(
+        "--epsilon", type=float, metavar="X", help="of recorded steps, the share of random actions (default: 0.1)"
+    )
     options = parser.parse_args(argv)
+    if options.to is not None or options.minari is not None:
+        return _record_steps(options)
+    if options.epsilon is not None:
+        raise Failure("--epsilon is for recorded steps, and a film is greedy; add --to FILE.npz or leave it out", 2)
+    return _record_pictures(options)
+
+
+def _record_pictures(options: argparse.Namespace) -> int:
     if (options.fps is not None and not 0 < options.fps <= 1000) or not 16 <= options.width <= 4096:
         raise Failure("--fps must lie above 0 and up to 1000, --width between 16 and 4096", 2)
     path = single_run(options.run, options.trust)
     config = config_from_dict(read_config(path))
-    agent = load(path, options.best)
-    _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
-    env = make_shown(config, "rgb_array")
-    try:
-        rate = options.fps or frame_rate(env)
-        returns = _film(env, play(env, agent, options.episodes, options.seed, _limit(options, config)), rate, options)
-    finally:
-        env.close()
+    with same_folder() as here:  # environments may change it
+        agent, limit = load(here / path, options.best), _limit(options, config)
+        _refuse_mode(config, "rgb_array", f"neuralq evaluate {path} plays without pictures")
+        env = make_shown(config, "rgb_array")
+        try:
+            rate = options.fps or frame_rate(env)
+            game = play(env, agent, options.episodes, options.seed, limit)
+            returns = _film(env, game, rate, options, here)
+        finally:
+            env.close()
     files = [Path(name) for name in (options.gif, options.mp4) if name is not None]
     plain = {
         "returns": returns,
@@ -92,6 +114,35 @@ def record(argv: list[str]) -> int:
     }
     lines = [f"{file}: {file.stat().st_size / 1e6:.2f} MB" for file in files]
     print_result(plain, options.json, [f"returns {', '.join(f'{value:g}' for value in returns)}", *lines])
+    return 0
+
+
+def _record_steps(options: argparse.Namespace) -> int:
+    """Steps in place of pictures."""
+    if options.gif or options.mp4 or (options.to and options.minari):
+        raise Failure("one at a time of --gif and --mp4, --to, and --minari", 2)
+    epsilon = 0.1 if options.epsilon is None else options.epsilon
+    if not 0 <= epsilon <= 1 or not str(options.to or ".npz").endswith(".npz"):
+        raise Failure("--epsilon must lie in [0, 1], and --to be a file.npz", 2)
+    path = single_run(options.run, options.trust)
+    config = config_from_dict(read_config(path))
+    with same_folder() as here:  # environments may change it
+        agent, limit = load(here / path, options.best), _limit(options, config)
+        with refusals_name(config.env):
+            env = make_one(config)
+        try:
+            data = record_steps(env, agent, options.episodes, epsilon, options.seed, limit)
+            if options.to is not None:
+                write_recorded(str(here / options.to), data)
+            else:
+                write_minari(options.minari, data, env, f"neuralq {config.learner}, ε = {epsilon:g}")
+        finally:
+            env.close()
+    name = options.to or f"minari:{options.minari}"
+    counts = {"num_steps": len(data.actions), "num_episodes": data.num_episodes, "epsilon": epsilon}
+    told = f"{name}: {counts['num_steps']:,} steps in {data.num_episodes:,} episodes, ε = {epsilon:g}"
+    plain = {"dataset": name, "run_dir": str(path), "mean_return": data.rewards.sum() / data.num_episodes, **counts}
+    print_result(plain, options.json, [told, f"neuralq train {config.env} --learner replay --dataset {name}"])
     return 0
 
 
@@ -156,8 +207,9 @@ def _has_display() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
 
 
-def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Namespace) -> list[float]:
-    writers = writers_for(options.gif, options.mp4, rate)
+def _film(env: gym.Env[Any, Any], game: Any, rate: float, options: argparse.Namespace, here: Path) -> list[float]:
+    gif, mp4 = (name and str(here / name) for name in (options.gif, options.mp4))
+    writers = writers_for(gif, mp4, rate)
     returns: list[float] = []
     try:
         with ProgressBar[tuple[int, str]](options.episodes, lambda report: Told(report[0], report[1:])) as bar:

@@ -16,6 +16,7 @@ from neuralq.apps.cli import Failure
 from neuralq.apps.cli.numbers import any_number, joined
 from neuralq.apps.cli.yaml_text import read_text
 from neuralq.runs.recipe.config import fitted_value
+from neuralq.runs.recipe.keywords import called_here
 
 __all__ = ["ENV_KWARGS", "as_typed", "hyphenated", "read_config_file", "read_options", "reader"]
 
@@ -98,7 +99,12 @@ def read_options(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict[s
             said = f"{name} {said}" if said.startswith("must ") else f"{name}: {said}"
         raise Failure(as_typed(said) + hint, 2) from error
     if unknown:
-        raise Failure(as_typed(f"unrecognized arguments: {' '.join(unknown)}") + hint, 2)
+        known = {action.dest.rpartition(".")[2]: action.option_strings for action in parser._actions}
+        names = [word[2:].partition("=")[0] for word in unknown if word.startswith("--")]
+        ours = [called_here(name.rpartition(".")[2], known) for name in names]
+        told = [f"--{name} is called {known[one][0]} here" for name, one in zip(names, ours, strict=True) if one]
+        told = told or [f"unrecognized arguments: {' '.join(unknown)}"]
+        raise Failure(as_typed(", ".join(told)) + hint, 2)
     given: dict[str, Any] = {}
     for name, value in vars(found).items():
         place, _, field = name.rpartition(".")

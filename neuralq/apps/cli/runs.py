@@ -17,9 +17,10 @@ from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
 from neuralq.checks import MissingExtra
-from neuralq.runs import Run, RunConfig, evaluate_run
+from neuralq.runs import Run, RunConfig, evaluate_run, load
 from neuralq.runs.changes import told
 from neuralq.runs.control import CONTROL, agent_of, last_cap
+from neuralq.runs.estimate import estimate_policy
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
@@ -27,6 +28,7 @@ from neuralq.runs.folder.run_folder import claimed, read_changes, read_config, r
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
+from neuralq.runs.offline.files import read_recorded
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.report import write_report
 from neuralq.runs.sweep import is_sweep_folder, open_sweep
@@ -47,7 +49,8 @@ def train(argv: list[str]) -> int:
     with claimed(options.run_dir, lambda: CONTROL.default_path(config)) as path:
         refuse_old_run(path)  # also by the run, but preparing takes seconds
         origin = started_from(config, options)
-        probed = "; for a second it is tried how exactly the environment can be resumed" if config.resume_probe else ""
+        is_probed = config.resume_probe and config.dataset is None
+        probed = "; for a second it is tried how exactly the environment can be resumed" if is_probed else ""
         say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
         with _hooks(path, config, options.tensorboard, options.wandb, options.hooks) as hooks:
             run = CONTROL.train(config, path, hooks)
@@ -164,20 +167,34 @@ def evaluate(argv: list[str]) -> int:
         "Play greedy episodes with the agent of a run: its last parameters, or its best where the run ended well below "
         "them, which it says. One of TD-Gammon plays a match: neuralq evaluate --against --help.",
         "neuralq evaluate RUN --episodes 100",
+        "neuralq evaluate RUN --on data.npz",
         "neuralq evaluate RUN --against gnubg --games 5000",
     )
     parser.add_argument("run", help="run folder")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
+    parser.add_argument(
+        "--on", metavar="DATA", help="play nothing: estimate the value from recorded steps, minari:ID or a file.npz"
+    )
     add_which(parser)
     add_trust(parser)
     options = parser.parse_args(argv)
     path = single_run(options.run, options.trust)
+    if options.on is not None:
+        return _estimate(path, options)
     result = evaluate_run(path, options.episodes, options.seed, options.best)
     which = agent_of(path) if options.best is None else "best" if options.best else "final"
     named = {"run_dir": str(options.run), "parameters": which}
     played = f"played with the {which} parameters" + (", the agent of the run" if options.best is None else "")
     print_result({**result.plain(), **named}, options.json, [*result.lines(), played])
+    return 0
+
+
+def _estimate(path: Path, options: argparse.Namespace) -> int:
+    """The value of the greedy policy by experience of others."""
+    agent, config = load(path, options.best), config_from_dict(read_config(path))
+    found = estimate_policy(agent, config, read_recorded(options.on), options.seed)
+    print_result({**found.plain(), "run_dir": str(path), "dataset": options.on}, options.json, found.lines())
     return 0
 
 

@@ -9,10 +9,14 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TextIO
 
-__all__ = ["listening", "make_standard_streams_safe"]
+__all__ = ["GRACE", "descriptor_of_its_own", "end_without_waiting", "listening", "make_standard_streams_safe"]
+
+GRACE = 5.0
+"""Seconds that threads which somebody's code has left have to end."""
 
 _IN_ASCII = dict(λ="lambda", ε="epsilon", γ="gamma", α="alpha", δ="delta", τ="tau", π="pi", θ="theta")
 _IN_ASCII |= {"±": "+-", "−": "-", "–": "-", "—": "-", "·": "-", "×": "x", "…": "...", "≤": "<=", "≥": ">=", "∞": "inf"}
@@ -40,6 +44,47 @@ def make_standard_streams_safe() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower().replace("-", "") != "utf8":
             stream.reconfigure(errors="neuralq")
+
+
+@contextlib.contextmanager
+def descriptor_of_its_own() -> Iterator[TextIO]:
+    """Standard output by a descriptor of its own; what others write to descriptor 1 goes to standard error meanwhile.
+
+    Libraries in C, and processes that are started, print there, whatever `sys.stdout` is.
+    """
+    try:
+        ours = sys.stdout.fileno() == 1
+    except (OSError, ValueError):  # it is no file
+        ours = False
+    if not ours:
+        yield sys.stdout
+        return
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with open(os.dup(kept), "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors) as own:
+            yield own
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def end_without_waiting(status: int) -> None:
+    """If a thread was left that no daemon is, the process ends with this status after `GRACE` seconds all the same.
+
+    Python waits at its end for every such thread, and an environment's may run for ever.
+    """
+    left = [t.name for t in threading.enumerate() if t is not threading.main_thread() and not t.daemon]
+    if not left:
+        return
+
+    def end() -> None:
+        time.sleep(GRACE)
+        print(f"neuralq: ended without waiting any longer for the thread {left[0]!r}", file=sys.stderr, flush=True)
+        os._exit(status)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 @contextlib.contextmanager

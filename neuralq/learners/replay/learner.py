@@ -13,6 +13,7 @@ from neuralq.learners import state
 from neuralq.learners.descent import Descent
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.conservative import conservative_gradient
 from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
 from neuralq.learners.replay.settings import ReplaySettings
@@ -88,7 +89,11 @@ class ReplayLearner:
         if targets.dim() == 2:
             s, a, targets = s.flatten(0, 1), a.reshape(-1), targets.reshape(-1)
             weight = None if weight is None else weight.reshape(-1)
-        errors = self._descent.fit(s, a, targets, weight)
+        if self.settings.conservative_alpha:
+            errors = conservative_gradient(self.engine, s, a, targets, weight, self.settings.conservative_alpha)
+            self._descent.step()
+        else:
+            errors = self._descent.fit(s, a, targets, weight)
         finish_update(self)
         return Update(errors, targets)
 
@@ -100,7 +105,7 @@ class ReplayLearner:
         if transition is not self._seen:
             self._seen, self._seen_arrays = transition, None
             t, dtype = transition, self.engine.flat.values.dtype
-            plain = self._descent.on_arrays is not None and self._is_plain
+            plain = self._descent.on_arrays is not None and self._is_plain and not self.settings.conservative_alpha
             alike = t.r_t.dtype == t.discount_t.dtype == dtype and t.r_t.shape == t.discount_t.shape == t.a_tm1.shape
             if plain and alike and t.r_t.dim() == 1 and len(t.s_tm1) == len(t.s_t) == len(t.r_t):
                 self._seen_arrays = tuple(x.numpy() for x in (t.s_tm1, t.a_tm1, t.r_t, t.discount_t, t.s_t))

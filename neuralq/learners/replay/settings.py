@@ -83,6 +83,8 @@ class ReplaySettings:
         temperature: τ of a rule's policy softmax(q/τ), in units of scaled rewards; None for 0.03.
         munchausen_alpha: α, how much of τ log π is added to the reward; None for 0.9.
         munchausen_floor: the smallest τ log π that counts, in units of scaled rewards; None for -1.
+        conservative_alpha: α of the penalty α·(log Σₐ exp Q(s, a) − Q(s, a_taken)), by which values of actions that
+            nobody took stay low (CQL(H); Kumar et al., 2020); 0 for none.
         target_epsilon: ε of the ε-greedy target policy of retrace, tree_backup and harutyunyan; None for 0.05.
         dqrc_beta: how strongly the second function of dqrc is pulled to 0; None for 1.
         dqrc_learning_rate: of the second function of dqrc; None for the learning rate.
@@ -111,6 +113,7 @@ class ReplaySettings:
     num_atoms: int | None = None
     value_min: float | None = None
     value_max: float | None = None
+    conservative_alpha: float = 0.0
     temperature: float | None = None
     munchausen_alpha: float | None = None
     munchausen_floor: float | None = None
@@ -127,6 +130,8 @@ class ReplaySettings:
         check_positive("learning_rate", self.learning_rate)
         if self.max_grad_norm is not None:
             check_positive("max_grad_norm", self.max_grad_norm)
+        if not 0 <= self.conservative_alpha < float("inf"):
+            raise ValueError(f"conservative_alpha must be at least 0 and finite, got {self.conservative_alpha!r}")
         check_choice("target_rule", self.target_rule, target_rules())
         check_choice("distribution", self.distribution, distributions())
         Optimiser(self.optimiser)
@@ -236,6 +241,12 @@ def _check_blocks(settings: ReplaySettings) -> None:
 
 def _check_combination(settings: ReplaySettings) -> None:
     """What the rule says it does not go with, in its words."""
+    if settings.conservative_alpha and (settings.returns is not MEAN or settings.rule.correction):
+        what = "distribution" if settings.returns is not MEAN else "target_rule"
+        raise ValueError(
+            f"conservative_alpha is for means that are learned from frozen targets, got {what}="
+            f"{getattr(settings, what)!r}; leave one of them out"
+        )
     met = {
         "num_steps": settings.num_steps > 1,
         "distribution": settings.returns is not MEAN,

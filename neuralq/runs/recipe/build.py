@@ -27,15 +27,18 @@ from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS
 from neuralq.runs.folder.env_probe import PROBE_SECONDS, SIMULATED, Resumability, is_resumable, untried
 from neuralq.runs.loop import Plan, seed_for
+from neuralq.runs.offline.files import read_recorded
+from neuralq.runs.offline.playback import OFFLINE, OfflineExperience, Playback, rows_of, whole_buffer
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs, make_one
 from neuralq.runs.recipe.lookahead import require_room
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
-from neuralq.runs.stream.encoding import encoder_for
+from neuralq.runs.stream.encoding import discrete_actions, encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
 from neuralq.runs.stream.table import TableWalk
+from neuralq.runs.stream.workers import WorkerVectorEnv
 from neuralq.types import QFunction, Transition
 
 __all__ = [
@@ -127,9 +130,10 @@ def build_session(config: RunConfig) -> Session:
     _check_device(config.device)
     if config.kind.experience == "table":
         return _walking_session(config)
-    envs = make_envs(config, _num_envs(config), training=True)
+    offline = config.dataset is not None
+    envs = make_envs(config, 1 if offline else _num_envs(config), training=not offline)
     try:
-        return _session(config, envs)
+        return _with_data(config, _session(config, envs)) if offline else _session(config, envs)
     except BaseException:
         with contextlib.suppress(Exception):
             envs.close()
@@ -150,7 +154,11 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     values, arrays = (learner.values, None) if isinstance(learner, HasValues) else (engine.all, array_values(engine))
     policy = EpsilonGreedyPolicy(values, lambda: epsilon.value(stream.num_steps), generators["policy"], arrays)
     frozen = None if normalisation is None else normalisation.frozen()
-    probe = _probe(config, envs, lambda: make_envs(config, _num_envs(config), training=True))
+    probe = (
+        OFFLINE
+        if config.dataset is not None
+        else _probe(config, envs, lambda: make_envs(config, _num_envs(config), training=True))
+    )
     _warm(config, engine, stream)
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
@@ -158,6 +166,33 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
         _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
+
+
+def _with_data(config: RunConfig, session: Session) -> Session:
+    """The session with recorded experience in place of what it would have met."""
+    assert config.dataset is not None and isinstance(session.stream, Interaction)
+    settings, data, stream = config.settings, read_recorded(config.dataset), session.stream
+    if stream.spec.masked:
+        raise ValueError("a data set says nothing of illegal actions, and this environment masks some; train in it")
+    if settings.rule.behaviour and data.probabilities is None:
+        raise ValueError(
+            f"target_rule={settings.target_rule!r} needs the probabilities with which actions were taken, and the data "
+            "set has none; neuralq record leaves them, or use tree_backup"
+        )
+    _, first_action = discrete_actions(stream.envs.single_action_space)
+    rows = rows_of(data, stream.encoder, first_action, stream.num_actions, config.gamma)
+    drawing = ReplayExperience(
+        whole_buffer(rows, settings), session.generators["samples"], settings.batch_size, settings.block_length,
+        settings.train_period, settings.train_period, settings.updates_per_period,
+    )  # fmt: skip
+    session.stream, session.experience = (
+        Playback(stream, data, config.dataset),
+        OfflineExperience(drawing, data, config.dataset),
+    )
+    session._early = None
+    if session.beside is not None:
+        session.beside.see(rows[0], rows[1])
+    return session
 
 
 def _walking_session(config: RunConfig) -> Session:
@@ -204,7 +239,7 @@ def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
 
 
 def _probe(config: RunConfig, envs: Any, make: Callable[[], Any]) -> Resumability:
-    if not config.resume_probe:
+    if not config.resume_probe or isinstance(envs, WorkerVectorEnv):  # whose state is out of reach
         return untried(envs)
     return is_resumable(
         make,

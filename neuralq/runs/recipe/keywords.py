@@ -119,8 +119,13 @@ def _unknown(name: str, value: Any, learner: str, accepted: set[str]) -> str:
     everything = {"run_dir", "hooks", "preset", *accepted}
     others = [n for n, k in LEARNERS.items() if name in {f.name for f in dataclasses.fields(k.settings)}]
     close = difflib.get_close_matches(name, sorted(everything), 3)
+    elsewhere = {f.name: n for n, k in LEARNERS.items() for f in dataclasses.fields(k.settings)}
     if (ours := called_here(name, everything)) is not None:
         hint = f"it is called {ours} here"
+    elif (theirs := called_here(name, elsewhere)) is not None:
+        hint = (
+            f"it is called {theirs} here, and belongs to the {elsewhere[theirs]} learner: learner={elsewhere[theirs]!r}"
+        )
     elif others:
         whose = " or ".join(others)
         hint = f"it belongs to the {whose} learner, and this is a {learner} run: add learner={others[0]!r}"

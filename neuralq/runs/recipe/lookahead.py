@@ -14,6 +14,7 @@ import numpy as np
 from neuralq.checks import check_fits
 from neuralq.q import MLP
 from neuralq.rules import Linear
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.stream import Interaction, ObservationSpec
 from neuralq.runs.stream.table import TableWalk
@@ -33,6 +34,8 @@ def num_updates(config: RunConfig) -> int:
         0
     """
     settings: Any = config.settings
+    if config.dataset is not None:
+        return config.total_steps // int(settings.train_period) * int(settings.updates_per_period)
     if config.kind.experience == "replay":
         left: int = config.total_steps - settings.learning_starts
         return 0 if left < 0 else (left // int(settings.train_period) + 1) * int(settings.updates_per_period)
@@ -41,7 +44,7 @@ def num_updates(config: RunConfig) -> int:
     return config.total_steps
 
 
-def warnings_ahead(config: RunConfig, stream: Interaction | TableWalk) -> list[str]:
+def warnings_ahead(config: RunConfig, stream: Interaction | TableWalk | Playback) -> list[str]:
     """A line for each reason for which this run cannot learn what it is meant to; none for most runs.
 
     Example:
@@ -77,6 +80,8 @@ def _target(config: RunConfig) -> str | None:
 
 
 def _exploration(config: RunConfig) -> str | None:
+    if config.dataset is not None:
+        return None
     start, end = config.epsilon_start, config.epsilon_end
     last = Linear(start, end, config.epsilon_decay_steps).value(config.total_steps)
     if abs(last - end) <= 0.5 * abs(start - end):
@@ -98,7 +103,7 @@ def _rate(config: RunConfig) -> str | None:
     )
 
 
-def _unused_masks(stream: Interaction | TableWalk) -> Iterator[str]:
+def _unused_masks(stream: Interaction | TableWalk | Playback) -> Iterator[str]:
     """Parts of an observation that are named as masks are, where no mask is told in the place that is obeyed."""
     for part in [] if stream.spec.masked else stream.encoder.parts:
         name = str(part.keys[-1]).lower() if part.keys else ""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from neuralq.runs.offline.playback import Playback
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.table import TableWalk
 
 __all__ = ["opening_lines"]
 
 
-def opening_lines(stream: Interaction | TableWalk) -> list[str]:
+def opening_lines(stream: Interaction | TableWalk | Playback) -> list[str]:
     """One line on what a value function is handed, and how it was scaled.
 
     Example:

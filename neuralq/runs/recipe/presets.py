@@ -7,6 +7,7 @@ from typing import Any
 
 from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
+from neuralq.rules.target_rule import target_rules
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
 from neuralq.runs.recipe.games import ATARI
@@ -232,6 +233,8 @@ REACHED: dict[tuple[str, str], str] = {
     ("CartPole-v1", "streaming"): "500.0 (498.8 to 500.0)",
     ("Acrobot-v1", "streaming"): "−116.0 (−298.3 to −91.1)",
     ("MountainCar-v0", "streaming"): "−200 (−200 to −200)",
+    ("Acrobot-v1", "replay"): "−81.8 (−83.5 to −80.7)",
+    ("MountainCar-v0", "replay"): "−173.1 (−200.0 to −119.3)",
     ("MinAtar/Asterix-v1", "rollout"): "57.1",
     ("MinAtar/Breakout-v1", "rollout"): "29.0",
     ("MinAtar/Freeway-v1", "rollout"): "65.5",
@@ -247,6 +250,9 @@ _YIELDS = {
     "target_period_updates": ("target_rate",),
 }
 """What of a preset gives way to a setting that is given."""
+
+_OF_FROZEN_TARGETS = {"target_period_updates", "target_rate", "average_updates", "noisy", "loss"}
+"""What gives way to a rule that corrects the gradient instead of freezing its targets, and takes none of it."""
 
 
 def preset_for(env: str, learner: str) -> dict[str, Any]:
@@ -322,8 +328,13 @@ def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
     Example:
         >>> yielding({"target_period_updates": 250, "learning_rate": 1e-3}, {"target_rate": 0.01})
         {'learning_rate': 0.001}
+        >>> yielding({"average_updates": 1000.0, "noisy": True}, {"target_rule": "dqrc"})
+        {}
     """
     gone = {over for name, overs in _YIELDS.items() if name in given for over in overs}
+    rule = target_rules().get(given.get("target_rule", ""))
+    if rule is not None and rule.correction:
+        gone |= _OF_FROZEN_TARGETS
     return {name: value for name, value in settings.items() if name not in gone}
 
 

@@ -47,6 +47,11 @@ footer { color: #555; font-size: .85rem; padding-top: 1.5rem; padding-bottom: 2r
 class Page:
     """A page put together from top to bottom; every text is escaped, only figures and tables go in as they are.
 
+    Args:
+        title: of the document.
+        lead: a sentence below it.
+        style: more of a style sheet, put after the page's own.
+
     Example:
         >>> page = Page("Run <1>")
         >>> page.paragraph("a & b")
@@ -56,6 +61,7 @@ class Page:
 
     title: str
     lead: str = ""
+    style: str = ""
     _body: list[str] = field(default_factory=list)
 
     def heading(self, text: str) -> None:
@@ -89,7 +95,7 @@ class Page:
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(self.title)}</title>
-<style>{_STYLE}</style>
+<style>{_STYLE}{self.style}</style>
 </head>
 <body>
 <header>

@@ -254,6 +254,21 @@ class Encoder:
         row: Array = encoded[0]
         return row if row.shape else np.array(row)
 
+    def is_batch(self, observation: Any) -> bool:
+        """Whether this is one observation or, with an axis before its own, many; what is neither is taken for one.
+
+        Example:
+            >>> encoder = encoder_for(spaces.Box(-1, 1, (4,)))
+            >>> encoder.is_batch(np.zeros(4)), encoder.is_batch(np.zeros((1, 4)))
+            (False, True)
+        """
+        part = self.parts[0]
+        try:
+            value = part.find(observation) if part.keys else observation
+            return bool(np.ndim(value) == len(part.shape) + 1)
+        except ValueError:
+            return False
+
     def _index(self, batch: Any) -> Array:
         index = np.zeros(self._num_envs(batch), np.int64)
         for part in self.parts:  # Horner's rule

@@ -236,10 +236,13 @@ class Interaction:
         if self._broken:
             raise EnvironmentFault("this interaction has ended with an error; start a new one")
         chosen, mu = _act(policy, self._s)
+        threads = torch.get_num_threads()
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
         except (Exception, SystemExit) as error:
             raise self._fault(describe_error(error)) from error
+        if torch.get_num_threads() != threads:  # with another number sums have other bits, and a run other times
+            torch.set_num_threads(threads)
         terminated, truncated = self._flags("terminated", terminated), self._flags("truncated", truncated)
         last = terminated | truncated
         r_t = self._checked_reward(reward)

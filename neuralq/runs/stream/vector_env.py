@@ -57,6 +57,7 @@ class SubEnvFault(RuntimeError):
     def __init__(self, index: int, problem: str) -> None:
         super().__init__(f"environment {index}{problem}")
         self.index = index
+        self.problem = problem
 
 
 def what_it_did(error: BaseException) -> str:
@@ -127,8 +128,8 @@ class SubEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _flag(self, field: str, value: Any) -> bool:
         """Whether an episode has ended; what is neither yes nor no would be cast to either without a word."""
         found = np.asarray(value)
-        if found.size == 1 and found.dtype.kind in "biuf" and found.reshape(-1)[0] in (0, 1):
-            return bool(found.reshape(-1)[0])
+        if found.size == 1 and found.dtype.kind in "biuf" and found.item() in (0, 1):
+            return bool(found.item())
         raise SubEnvFault(self.index, f": {field} must be true or false, got {value!r}")
 
     def _raised(self, error: BaseException) -> SubEnvFault:

@@ -53,6 +53,7 @@ class GammonRun:
         points_per_game: of the last evaluation, by opponent: points per game and their standard error.
         weights_sha256: of the weights' bytes.
         interrupted_by: name of the signal that ended it early, or None.
+        stopped_by: which hook ended it before its budget was spent, and why; None if none did.
     """
 
     run_dir: Path
@@ -63,6 +64,7 @@ class GammonRun:
     points_per_game: dict[str, tuple[float, float]]
     weights_sha256: str
     interrupted_by: str | None
+    stopped_by: str | None = None
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -178,6 +180,7 @@ def _result(config: TdGammonConfig, trainee: _Trainee, progress: Progress, folde
         points_per_game=dict(trainee.points),
         weights_sha256=network.sha256(),
         interrupted_by=progress.interrupted_by,
+        stopped_by=progress.stopped_by,
     )
 
 

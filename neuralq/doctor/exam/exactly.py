@@ -1,0 +1,78 @@
+"""V7: where the environment is a finite model, exact values in place of estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+
+from neuralq.doctor.exam.case import CannotMeasure, Case
+from neuralq.doctor.findings import Finding
+from neuralq.exact import solve
+from neuralq.exact.evaluation import evaluate
+from neuralq.mdp import FiniteMDP
+
+__all__ = ["against_optimum", "regret"]
+
+_THRESHOLD = 0.1
+
+
+def regret(case: Case) -> Finding:
+    """V7: what the greedy policy loses from the start, over the span of the optimal values; exact."""
+    model, values = _values(case)
+    best = solve(model, case.gamma)
+    greedy = np.where(model.legal, values, -np.inf).argmax(1)
+    v = evaluate(model, np.where(model.is_terminal, -1, greedy), case.gamma)
+    start = model.start_distribution
+    lost = float(start @ (best.v - v))
+    scale = max(float(np.ptp(best.v)), float(np.abs(start @ best.v)), 1e-12)
+    share = lost / scale
+    off = share > _THRESHOLD
+    said = f"from the start the greedy policy is worth {start @ v:.6g}, and the best {start @ best.v:.6g} (exact)"
+    return Finding(
+        "V7", "the greedy policy is worse than the best", "algorithm", "B", share, (share, share), _THRESHOLD,
+        "our own", off,
+        said, "see the other findings; the exact answer says in which states the policy errs",
+        f"neuralq solve {case.world.name} --gamma {case.gamma:g}",
+    )  # fmt: skip
+
+
+def against_optimum(case: Case) -> Finding:
+    """V7a: the errors |Q − Q*| over the largest |Q*|, at the states that its policy meets; exact."""
+    model, values = _values(case)
+    best = solve(model, case.gamma)
+    met = np.zeros(model.num_states, bool)
+    for one in (*case.greedy, *case.explored):
+        met[_states(case, one.observations)] = True
+    rows = (model.legal & met[:, None]) & ~model.is_terminal[:, None]
+    if not rows.any():
+        raise CannotMeasure("no state of the model was met")
+    errors = np.abs(values - np.nan_to_num(best.q))[rows]
+    scale = max(float(np.nanmax(np.abs(best.q))), 1e-12)
+    worst, typical = float(errors.max()) / scale, float(np.sqrt((errors**2).mean())) / scale
+    return Finding(
+        "V7a", "values are far from the optimal ones", "algorithm", "B", typical, (typical, worst), 1.0, "our own",
+        typical > 1,
+        f"at {int(met.sum())} states that were met, values differ from Q* by {100 * typical:.3g} % of its largest "
+        f"(exact)",
+        "an update that diverges: see the lab's verdict (R3) and its remedies",
+        f"neuralq solve {case.world.name} --gamma {case.gamma:g}",
+    )  # fmt: skip
+
+
+def _values(case: Case) -> tuple[FiniteMDP, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
+    model = case.world.model
+    if model is None:
+        raise CannotMeasure("the environment has no model that could be solved exactly")
+    if case.world.is_discrete:
+        space = case.world.observation_space
+        assert isinstance(space, spaces.Discrete)
+        if int(space.n) != model.num_states:
+            raise CannotMeasure("observations are not the states of the model")
+        return model, case.subject.values(np.arange(model.num_states) + int(space.start))
+    raise CannotMeasure("observations are not the numbers of the model's states")
+
+
+def _states(case: Case, observations: object) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    space = case.world.observation_space
+    assert isinstance(space, spaces.Discrete)
+    return np.asarray(observations, np.int64).reshape(-1) - int(space.start)

@@ -1,0 +1,162 @@
+"""D1–D5: the experience that was learned from.
+
+Columns of the ``.npz``: ``obs, action, reward, terminated, truncated, next_obs`` in the order of time,
+one environment's
+rows after each other; ``age`` where rows are not in that order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from neuralq.doctor.exam.case import CannotMeasure, Case
+from neuralq.doctor.findings import Finding, Grade
+from neuralq.types import Array
+
+__all__ = ["actions_taken", "check_columns", "merged_ends", "reset_leak", "rewards_seen", "window"]
+
+COLUMNS = ("obs", "action", "reward", "terminated", "truncated", "next_obs")
+
+
+def check_columns(stored: Mapping[str, Array]) -> dict[str, Array]:
+    """The columns, if they are all there and equally long.
+
+    Raises:
+        ValueError: one is missing or of another length, with the line that writes the file.
+
+    Example:
+        >>> check_columns({"obs": np.zeros((2, 3))})
+        Traceback (most recent call last):
+        ValueError: the data lack the column 'action'; write it with numpy.savez('data.npz', obs=…, action=…, ...
+    """
+    write = "numpy.savez('data.npz', " + ", ".join(f"{name}=…" for name in COLUMNS) + ")"
+    for name in COLUMNS:
+        if name not in stored:
+            raise ValueError(f"the data lack the column {name!r}; write it with {write}")
+    num = len(stored["reward"])
+    for name in COLUMNS:
+        if len(stored[name]) != num or num == 0:
+            raise ValueError(f"the column {name!r} has {len(stored[name])} rows and 'reward' {num}; write {write}")
+    found = {name: np.asarray(stored[name]) for name in COLUMNS}
+    for name in ("action", "reward", "terminated", "truncated"):
+        found[name] = found[name].reshape(num)
+    order = np.argsort(np.asarray(stored["age"]).reshape(num))[::-1] if "age" in stored else np.arange(num)
+    return {name: column[order] for name, column in found.items()}
+
+
+def _stored(case: Case) -> Mapping[str, Array]:
+    if case.stored is None:
+        raise CannotMeasure("the data that was learned from was not given (--data file.npz)")
+    return case.stored
+
+
+def _lengths(stored: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Steps of each episode that begins in the data, and the row of its last step."""
+    ends = stored["terminated"].astype(bool) | stored["truncated"].astype(bool)
+    same = (stored["next_obs"][:-1] == stored["obs"][1:]).reshape(len(ends) - 1, -1).all(1)
+    last = np.flatnonzero(ends | np.append(~same, True))
+    lengths = np.diff(np.concatenate([[-1], last]))
+    return lengths, last
+
+
+def merged_ends(case: Case) -> Finding:
+    """D1: rows that are marked as terminated and were truncated."""
+    stored = _stored(case)
+    terminated, truncated = (stored[name].astype(bool) for name in ("terminated", "truncated"))
+    both = int((terminated & truncated).sum())
+    limit, at = case.world.limit, 0
+    if limit is not None:
+        lengths, last = _lengths(stored)
+        by_end = lengths[terminated[last]]
+        near = [int((by_end == limit - k).sum()) for k in range(1, 6)]
+        at = int((by_end == limit).sum())
+        at = at if at > 3 + 3 * max(near) else 0
+    rows = max(both, at)
+    return Finding(
+        "D1", "truncation is stored as termination", "data", "B", float(rows), None, 0.0, "any", rows > 0,
+        f"{rows} rows are marked as the end of the world where the time limit cut the episode",
+        "store `terminated` alone as the end, and bootstrap past `truncated`",
+        "buffer.add(obs, action, reward, terminated, next_obs)  # not terminated or truncated",
+    )  # fmt: skip
+
+
+def reset_leak(case: Case) -> Finding:
+    """D2: rows that were cut and whose successor is the first observation of the next episode."""
+    stored = _stored(case)
+    cut = stored["truncated"].astype(bool)[:-1] | stored["terminated"].astype(bool)[:-1]
+    same = (stored["next_obs"][:-1] == stored["obs"][1:]).reshape(len(cut), -1).all(1)
+    rows = int((cut & same).sum())
+    return Finding(
+        "D2", "the next episode's start is stored as a successor", "data", "B", float(rows), None, 0.0, "any", rows > 0,
+        f"in {rows} of {int(cut.sum())} rows at which an episode ended, next_obs is where the next one began",
+        "store info['final_obs'] at the end of an episode (vector environments that reset by themselves)",
+        "assert not (next_obs[:-1][ends[:-1]] == obs[1:][ends[:-1]]).all(-1).any()",
+    )  # fmt: skip
+
+
+def window(case: Case) -> Finding:
+    """D3: how many episodes, and how many horizons, are stored at a time."""
+    if case.stored is not None:
+        lengths, _ = _lengths(case.stored)
+        rows, episodes = float(len(case.stored["reward"])), float(len(lengths))
+    elif case.settings.capacity is not None:
+        rows = min(case.settings.capacity, case.settings.env_steps or case.settings.capacity)
+        episodes = rows / max(float(np.mean([one.length for one in case.chance])), 1.0)
+    else:
+        raise CannotMeasure("neither the data nor the size of the buffer is known (--data, or --set capacity=N)")
+    typical = min(case.horizon, float(np.median([one.within for one in case.greedy])))
+    spans = rows / max(typical, 1.0)
+    few = episodes < 10 or spans < 3
+    return Finding(
+        "D3", "the buffer holds too little", "data", "B", spans, None, 3.0, "our own: 10 episodes and 3 horizons", few,
+        f"the buffer holds {rows:,.0f} steps, some {episodes:,.0f} episodes and {spans:,.1f} times as long as "
+        f"rewards matter",
+        "a larger buffer: 10,000 steps and more", f"neuralq train {case.world.name} --learner replay --capacity 50000",
+    )  # fmt: skip
+
+
+def actions_taken(case: Case) -> Finding:
+    """D4: how much of every action there is; where no data are given, what exploration the settings allowed."""
+    num = case.world.num_actions
+    grade: Grade
+    if case.stored is not None:
+        index = np.asarray(case.stored["action"], np.int64) - case.world.first_action
+        counts = np.bincount(np.clip(index, 0, num - 1), minlength=num)
+        said, grade = "in the data", "B"
+    elif case.settings.epsilon_start == 0 and case.settings.epsilon_end == 0:
+        return _exploration(
+            "B", 1.0, "the settings say ε = 0 from first to last: nothing but the greedy action was ever tried"
+        )
+    else:
+        counts = np.bincount(np.concatenate([one.actions for one in case.greedy]), minlength=num)
+        said, grade = "in greedy episodes", "C"
+    share = counts / counts.sum()
+    most = float(share.max())
+    kept = share[share > 0]
+    entropy = float(-(kept * np.log(kept)).sum() / np.log(num)) if num > 1 else 1.0
+    return _exploration(
+        grade,
+        most,
+        f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most",
+    )
+
+
+def _exploration(grade: Grade, most: float, said: str) -> Finding:
+    return Finding(
+        "D4", "hardly any action but one is tried", "data", grade, most, None, 0.95, "our own", most > 0.95, said,
+        "explore more: ε from 1 down to 0.05, over a tenth of training or more",
+        "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
+    )  # fmt: skip
+
+
+def rewards_seen(case: Case) -> Finding:
+    """D5: the share of rows that hold a reward."""
+    stored = _stored(case)
+    share = float((stored["reward"] != 0).mean())
+    return Finding(
+        "D5", "no reward was ever seen", "data", "B", share, None, 0.0, "none at all", share == 0,
+        f"{100 * share:.3g} % of the stored steps hold a reward", "explore longer, or give rewards on the way",
+        "print((buffer.rewards != 0).mean())",
+    )  # fmt: skip

@@ -1,0 +1,246 @@
+"""The examination: load, play, measure within the budget, decide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from neuralq.checks import check_choice, check_discount, check_positive, check_whole
+from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
+from neuralq.doctor.findings import Finding
+from neuralq.doctor.loading import load_subject
+from neuralq.doctor.play import Clock, EnvironmentRaised, returns_from
+from neuralq.doctor.report import Report
+from neuralq.doctor.subject import Settings, Subject, with_settings
+from neuralq.doctor.tree import decide
+from neuralq.doctor.weights import CannotLoad, plain_bytes, read_arrays
+from neuralq.doctor.worlds import World, open_world
+from neuralq.types import Array
+
+__all__ = ["LEVELS", "NUM_PARTS", "examine"]
+
+LEVELS = ("exam",)
+
+_GAMMA = 0.99
+"""Where neither the caller nor the file says."""
+
+_MEASUREMENTS: dict[str, Measurement] = {
+    "V1": values.has_learned,
+    "V4": values.soft_divergence,
+    "V5": values.reach,
+    "V2": values.bias,
+    "V7": exactly.regret,
+    "V7a": exactly.against_optimum,
+    "V3": hypotheses.hypotheses,
+    "V3a": hypotheses.one_step,
+    "E1": environment.contract,
+    "E2": environment.determinism,
+    "E3": environment.disguised_limit,
+    "E4": environment.observation_scale,
+    "E5": environment.reward_scale,
+    "E6": aliasing.aliasing,
+    "D1": stored.merged_ends,
+    "D2": stored.reset_leak,
+    "D3": stored.window,
+    "D4": stored.actions_taken,
+    "D5": stored.rewards_seen,
+    "R6": network.lag,
+    "R6a": network.untouched,
+    "R1": network.dormant,
+    "R2": network.effective_rank,
+    "R3": network.kernel,
+    "R4": network.churn,
+    "V6": values.rank,
+    "V8": values.generalisation,
+    "V6a": values.better_actions,
+    "R5": network.plasticity,
+}
+NUM_PARTS = len(_MEASUREMENTS) + 2
+"""Of an examination: the measurements, and twice episodes are played."""
+
+
+def examine(
+    subject: Any,
+    env: Any = None,
+    *,
+    gamma: float | None = None,
+    data: Any = None,
+    settings: Mapping[str, Any] | None = None,
+    net: str | None = None,
+    level: Literal["exam"] = "exam",
+    budget_s: float = 60.0,
+    seed: int = 0,
+    progress: Callable[[int, str], None] | None = None,
+) -> Report:
+    """Why a value function is bad: the environment, the algorithm, the representation, the data, or luck.
+
+    Args:
+        subject: as `load_subject` takes it: a neuralq run folder, a file of Stable-Baselines3, sb3-contrib, CleanRL or
+            PyTorch, an `nn.Module`, or a function ``[N, *obs] -> [N, A]``.
+        env: a Gymnasium id, "module:id", an environment, or a class or function that makes one; of a run folder its own
+            by default.
+        gamma: γ; by default what the file says, else 0.99.
+        data: what was learned from: the path of an ``.npz``, or a mapping of the columns ``obs, action, reward,
+            terminated, truncated, next_obs`` and perhaps ``age``.
+        settings: of the training, where the file does not say: fields of `Settings`, such as
+            ``{"target_period_updates": 500, "updates": 50_000}``.
+        net: "module:Class" of a network that a state dict belongs to.
+        level: ``"exam"`` measures.
+        budget_s: seconds for all of it.
+        seed: of every draw.
+        progress: told how many of `NUM_PARTS` parts are through, and what comes next.
+
+    Raises:
+        CannotLoad: the subject cannot be rebuilt, or does not fit the environment.
+        ValueError: the environment cannot be made, or an argument does not fit.
+
+    Example:
+        >>> import numpy as np
+        >>> report = examine(lambda obs: np.zeros((len(obs), 2)), "CartPole-v1", budget_s=5)
+        >>> report.healthy, next(one for one in report.findings if one.id == "V1").cause
+        (False, 'algorithm')
+    """
+    check_choice("level", level, LEVELS)
+    check_positive("budget_s", budget_s)
+    check_whole("seed", seed, 0)
+    clock = Clock(budget_s)
+    loaded = load_subject(subject, net)
+    given = env if env is not None else loaded.env
+    if given is None:
+        raise ValueError("which environment the subject was trained in is not known; pass env (--env ID)")
+    known = with_settings(loaded.settings, settings or {})
+    discount = gamma if gamma is not None else known.gamma if known.gamma is not None else _GAMMA
+    check_discount("gamma", discount)
+    world = open_world(given)
+    columns = _columns(data)
+    _check_fits(loaded, world)
+    say = _Teller(progress)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small batches: threads would only wait for each other
+    try:
+        return _examined(loaded, world, discount, known, columns, seed, clock, say)
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Teller:
+    """Counts what is through."""
+
+    def __init__(self, progress: Callable[[int, str], None] | None) -> None:
+        self.progress, self.so_far = progress, 0
+
+    def __call__(self, text: str) -> None:
+        if self.progress is not None:
+            self.progress(min(self.so_far, NUM_PARTS), text)
+        self.so_far += 1
+
+
+def _examined(
+    subject: Subject, world: World, gamma: float, settings: Settings, columns: Mapping[str, Array] | None, seed: int,
+    clock: Clock, say: _Teller,
+) -> Report:  # fmt: skip
+    try:
+        case = begin(subject, world, gamma, settings, columns, seed, clock, say)
+    except EnvironmentRaised as error:
+        return _broken(subject, world, gamma, clock, str(error))
+    measured, missing = _measured(case, say)
+    findings, headline = decide(measured)
+    return Report(
+        subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, _drawn(case)
+    )
+
+
+def _measured(case: Case, say: _Teller) -> tuple[list[Finding], dict[str, str]]:
+    measured: list[Finding] = []
+    missing: dict[str, str] = {}
+    for name, measure in _MEASUREMENTS.items():
+        say(f"measuring {name}")
+        if case.clock.left <= 0:
+            missing[name] = f"the budget of {case.clock.budget_s:g} s was spent; give more with --budget"
+            continue
+        try:
+            found = measure(case)
+            measured += [found] if isinstance(found, Finding) else found
+        except CannotMeasure as reason:
+            missing[name] = str(reason)
+        except (RuntimeError, ValueError, np.linalg.LinAlgError, NotImplementedError) as error:
+            missing[name] = (
+                f"it failed: {type(error).__name__}: {str(error).splitlines()[0][:200] if str(error) else ''}"
+            )
+    return measured, missing
+
+
+def _broken(subject: Subject, world: World, gamma: float, clock: Clock, what: str) -> Report:
+    found = Finding(
+        "E1", "the environment raises errors", "environment", "B", 1.0, None, 0.5, "any", True, what,
+        "mend the environment first", f"python -c \"import gymnasium as gym; gym.make('{world.name}').reset(seed=0)\"",
+    )  # fmt: skip
+    missing = {name: "the environment raised an error" for name in _MEASUREMENTS if name != "E1"}
+    findings, headline = decide([found])
+    return Report(subject.origin, world.name, gamma, headline, findings, (found,), missing, clock.spent)
+
+
+def _columns(data: Any) -> dict[str, Array] | None:
+    if data is None:
+        return None
+    if isinstance(data, str | Path):
+        return stored.check_columns(read_arrays(plain_bytes(Path(data)), str(data)))
+    if isinstance(data, Mapping):
+        return stored.check_columns(data)
+    raise ValueError(f"data must be the path of an .npz or a mapping of columns, got {type(data).__name__}")
+
+
+def _check_fits(subject: Subject, world: World) -> None:
+    """One observation through the values before anything takes time.
+
+    Raises:
+        CannotLoad: they do not go together.
+    """
+    env = world.make()
+    try:
+        first = np.asarray(env.reset(seed=0)[0])
+    except Exception:
+        return  # said when it is played
+    finally:
+        env.close()
+    try:
+        shape = subject.values(np.stack([first, first])).shape
+    except CannotLoad:
+        raise
+    except Exception as error:
+        raise CannotLoad(
+            f"the values cannot be computed for observations of {world.name}, of shape {list(first.shape)} and dtype "
+            f"{first.dtype} ({str(error).splitlines()[0][:160] if str(error) else type(error).__name__}); name the "
+            "environment it was trained in with --env, or export it with what prepares observations"
+        ) from error
+    if shape != (2, world.num_actions):
+        raise CannotLoad(
+            f"there are {shape[-1]} action values for an observation, and {world.name} has {world.num_actions} "
+            f"actions; "
+            "name the environment it was trained in with --env"
+        )
+    if subject.first_action not in (None, world.first_action):
+        raise CannotLoad(
+            f"the actions begin with {subject.first_action}, and those of {world.name} with {world.first_action}; name "
+            "the environment it was trained in with --env"
+        )
+
+
+def _drawn(case: Case) -> dict[str, Array]:
+    """Points for the page: Q and G of greedy steps, and Q at the start beside the return."""
+    rng, pairs, starts = case.rng(99), [], []
+    for one in case.greedy:
+        returns = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        if len(returns):
+            q = one.values[np.arange(len(returns)), one.actions[: len(returns)]]
+            pairs.append(np.column_stack([returns, q]))
+            starts.append([one.score, one.values[0].max(), returns[0]])
+    if not pairs:
+        return {}
+    points = np.concatenate(pairs)
+    return {"pairs": points[rng.permutation(len(points))[:800]], "starts": np.array(starts)}

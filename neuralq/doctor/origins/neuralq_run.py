@@ -1,0 +1,89 @@
+"""neuralq's own run folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuralq.doctor.origins.record import Origin
+from neuralq.doctor.subject import Settings, Subject, of_network
+from neuralq.doctor.weights import CannotLoad
+from neuralq.runs import load
+from neuralq.runs.agent import Agent
+from neuralq.runs.folder.run_folder import is_run_folder, read_config, read_metrics
+from neuralq.runs.recipe.config import RunConfig, config_from_dict
+from neuralq.types import Array
+
+__all__ = ["NEURALQ_RUN"]
+
+
+def _load(path: Path, net: str | None) -> Subject:
+    if net is not None:
+        raise CannotLoad(f"{path} is a run folder, which says itself what its network is; leave --net out")
+    try:
+        agent = load(path)
+    except (RuntimeError, ValueError) as error:
+        raise CannotLoad(f"cannot load the run {path}: {error}") from error
+    if not isinstance(agent, Agent):
+        raise CannotLoad(f"{path} is a run of {type(agent).__name__}, whose moves are no actions of an environment")
+    config = config_from_dict(read_config(path))
+    env = {"env": config.env, "env_kwargs": dict(config.env_kwargs)}
+    return of_agent(agent, f"neuralq run {path}", _settings(config, path, agent.reward_scale), env)
+
+
+def of_agent(agent: Agent, origin: str, settings: Settings, env: object = None) -> Subject:
+    """The subject that an agent of neuralq is.
+
+    Raises:
+        CannotLoad: its observations carry an action mask.
+    """
+    if agent.spec.masked:
+        raise CannotLoad("agents whose observations carry an action mask are not examined yet")
+
+    def encode(observations: Array) -> Tensor:
+        encoded = np.asarray(agent.encoder.encode(observations))
+        if agent.normalisation is not None:
+            encoded = agent.normalisation.observe(encoded)
+        return torch.from_numpy(encoded)
+
+    def outputs(network: nn.Module, x: Tensor) -> Tensor:
+        given: Tensor = network.all(x)  # type: ignore[operator]
+        return given
+
+    assert isinstance(agent.q, nn.Module)
+    return of_network(
+        agent.q, origin, encode=encode, outputs=outputs, settings=settings, num_actions=agent.spec.num_actions,
+        first_action=agent.first_action, env=env,
+    )  # fmt: skip
+
+
+def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
+    own = config.settings
+    traits = config.kind.traits(own)
+    rows = [row for row in read_metrics(path) if isinstance(row.get("env_steps"), int)]
+    env_steps = float(max((row["env_steps"] for row in rows), default=0)) or None
+    seen = [row["updates"] for row in rows if isinstance(row.get("updates"), int | float)]
+    per_step = getattr(own, "updates_per_period", 1) / getattr(own, "train_period", 1)
+    learned = None if env_steps is None else max(env_steps - getattr(own, "learning_starts", 0), 0)
+    updates = float(max(seen)) if seen else None if learned is None else learned * per_step
+    capacity, batch = getattr(own, "capacity", None), getattr(own, "batch_size", None)
+    return Settings(
+        gamma=config.gamma,
+        learning_rate=traits.step_size,
+        num_steps=float(getattr(own, "num_steps", 1)) if traits.replay else 1.0,
+        lambda_=traits.lambda_,
+        target_period_updates=float(traits.target_period or 1),
+        updates=updates,
+        env_steps=env_steps,
+        batch_size=None if batch is None else float(batch),
+        capacity=None if capacity is None else float(capacity),
+        epsilon_start=config.epsilon_start,
+        epsilon_end=config.epsilon_end,
+        reward_scale=reward_scale,
+    )
+
+
+NEURALQ_RUN = Origin("a neuralq run folder", is_run_folder, _load, place=0)

@@ -1,0 +1,163 @@
+"""The report as one HTML page that loads nothing: headline, five causes, what was found, figures, the rest."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neuralq.doctor.findings import CAUSES, Cause, Finding
+from neuralq.figures import COLOURS, draw_svg, tame
+from neuralq.runs.report.page import Page, format_number, html_table
+from neuralq.types import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from neuralq.doctor.report import Report
+
+__all__ = ["page_of"]
+
+_STYLE = """
+pre { background: #f3f3f3; padding: .5rem .8rem; overflow-x: auto; font-size: .85rem; border-radius: .3rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .2rem; }
+@media (min-width: 70rem) { .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 1.5rem; } }
+@media (prefers-color-scheme: dark) {
+  :root { color-scheme: dark; }
+  body { background: #16181b; color: #e6e6e6; }
+  .lead, .caption, figcaption, footer { color: #b4b8bd; }
+  .warning { background: #33251b; }
+  pre { background: #24272b; }
+  th, td { border-bottom-color: #3a3e44; }
+  svg.figure { filter: invert(1) hue-rotate(180deg); }
+}
+"""
+_GRADES = {"A": "shown by a controlled experiment", "B": "named by a measurement", "C": "a vital sign, no verdict"}
+
+
+def page_of(report: Report) -> Page:
+    """The page of a report.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    page = Page(f"Examination of {report.subject}", f"on {report.env}, γ = {report.gamma:g}", _STYLE)
+    page.paragraph(report.headline, warning=not report.healthy)
+    page.heading("Which of the five causes")
+    page.table(
+        html_table("the best evidence for each", ("cause", "evidence", "grade"), [_triage(report, c) for c in CAUSES])
+    )
+    named = [one for one in report.findings if one.grade in "AB"]
+    if named:
+        page.heading("What was found, the first cause first")
+        for one in named:
+            page.table(_found(one))
+    _figures(page, report)
+    _vital_signs(page, report)
+    _factorial(page, report)
+    page.heading("What was not measured, and why")
+    if report.not_measured:
+        page.table(
+            html_table("nothing here speaks for or against", ("", "why"), [*map(list, report.not_measured.items())])
+        )
+    else:
+        page.paragraph("Everything was measured.")
+    rows = [
+        [one.id, one.title if one.flagged else "–", _number(one), _threshold(one), one.evidence]
+        for one in report.measured
+    ]
+    page.folded(
+        "Everything that was measured", html_table("", ("", "flagged as", "value", "threshold", "in words"), rows)
+    )
+    return page
+
+
+def _triage(report: Report, cause: Cause) -> list[str]:
+    flagged = [one for one in report.findings if one.cause == cause]
+    if flagged:
+        return [cause, f"{flagged[0].title} ({flagged[0].id})", f"{flagged[0].grade}: {_GRADES[flagged[0].grade]}"]
+    looked = [one.id for one in report.measured if one.cause == cause]
+    return [cause, f"nothing flagged ({', '.join(looked)})" if looked else "not measured", "–"]
+
+
+def _found(one: Finding) -> str:
+    interval = (
+        ""
+        if one.interval is None
+        else f", 95 % from {format_number(one.interval[0])} to {format_number(one.interval[1])}"
+    )
+    return (
+        f"<h3>{escape(one.title)}</h3>\n<p>{escape(one.evidence[:1].upper() + one.evidence[1:])}.</p>\n<p>{one.id}, "
+        f"grade {one.grade} "
+        f"({_GRADES[one.grade]}): {format_number(one.value)}{interval}; {escape(_threshold(one))}.</p>\n"
+        f"<p>Remedy: {escape(one.remedy)}.</p>\n<p>This would confirm it:</p>\n<pre>{escape(one.confirm)}</pre>"
+    )
+
+
+def _number(one: Finding) -> str:
+    if one.interval is None:
+        return format_number(one.value)
+    return f"{format_number(one.value)} ({format_number(one.interval[0])} to {format_number(one.interval[1])})"
+
+
+def _threshold(one: Finding) -> str:
+    bound = "" if one.threshold is None else f"threshold {format_number(one.threshold)}"
+    return ", ".join(filter(None, (bound, one.source))) or "–"
+
+
+def _figures(page: Page, report: Report) -> None:
+    pairs, starts = report.drawn.get("pairs"), report.drawn.get("starts")
+    if pairs is None or starts is None:
+        return
+    page.heading("Values against returns")
+    page.figure(
+        _scatter("pairs", pairs[:, 0], pairs[:, 1], "return that followed, discounted", "value Q(s, a)", identity=True),
+        "Each point is a step of a greedy episode: what was returned from there, and what the values said. On the line "
+        "both agree; above it values are too high.",
+    )
+    page.figure(
+        _scatter(
+            "starts", starts[:, 0], starts[:, 1], "return of the episode, undiscounted", "value of its first step"
+        ),
+        "Each point is a greedy episode: what it returned in all, and what its first value promised (discounted).",
+    )
+
+
+def _scatter(name: str, x: Floats, y: Floats, below: str, beside: str, identity: bool = False) -> str:
+    def paint(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot(tame(x), tame(y), ".", color=COLOURS[0], alpha=0.5)
+        if identity:
+            ends = np.array([min(float(x.min()), float(y.min())), max(float(x.max()), float(y.max()))])
+            axes.plot(tame(ends), tame(ends), color="#555555", linestyle=":", linewidth=1.4, label="value = return")
+            axes.legend()
+        axes.set_xlabel(below)
+        axes.set_ylabel(beside)
+
+    said = (
+        f"{len(x)} points; {below} from {x.min():.4g} to {x.max():.4g}, {beside} from {y.min():.4g} to {y.max():.4g}."
+    )
+    return draw_svg(name, beside, said, (5.2, 3.6), paint)
+
+
+def _vital_signs(page: Page, report: Report) -> None:
+    signs = [one for one in report.measured if one.id.startswith("R")]
+    if signs:
+        page.heading("The network beside fresh ones")
+        rows = [[one.id, _number(one), one.evidence] for one in signs]
+        page.table(html_table("vital signs; alone they prove nothing", ("", "value", "in words"), rows))
+
+
+def _factorial(page: Page, report: Report) -> None:
+    cells = report.drawn.get("factorial")
+    if cells is None:
+        return
+    page.heading("Two by two: their learner and body, and ours")
+    rows = [
+        [name, *(format_number(float(x)) for x in row)]
+        for name, row in zip(("their body", "our body"), cells, strict=True)
+    ]
+    page.table(
+        html_table("greedy return, interquartile mean over seeds", ("", "their algorithm", "our algorithm"), rows)
+    )

@@ -1,0 +1,131 @@
+"""The environment of an examination: copies of it, its limit of steps, and its model where it has one."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+from neuralq.mdp import FiniteMDP
+from neuralq.runs.recipe.games import make_single, refusals_name
+from neuralq.runs.recipe.handed import Handed, handed_over
+from neuralq.runs.recipe.stand_in import Maker, standing_in
+from neuralq.runs.stream.encoding import discrete_actions
+from neuralq.types import Array
+
+__all__ = ["World", "open_world"]
+
+_FOREVER = 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What is known of an environment, and a way to make more of it.
+
+    Args:
+        name: in words.
+        make: makes one.
+        num_actions: A.
+        first_action: the environment's name of action 0.
+        observation_space: a Box or a Discrete space.
+        limit: steps after which `TimeLimit` truncates; None without one.
+        liftable: whether that limit can be lifted, so that episodes go on past it.
+        model: the exact model; None where there is none.
+        command: how it is named at the command line.
+    """
+
+    name: str
+    make: Maker
+    num_actions: int
+    first_action: int
+    observation_space: spaces.Space[Any]
+    limit: int | None
+    liftable: bool
+    model: FiniteMDP | None
+    command: str
+
+    def lifted(self) -> gym.Env[Any, Any]:
+        """One whose episodes go on past the limit."""
+        env = self.make()
+        found = _limit_of(env)
+        if found is not None:
+            found._max_episode_steps = _FOREVER
+        return env
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether observations are numbers of states."""
+        return isinstance(self.observation_space, spaces.Discrete)
+
+    def as_rows(self, observations: Array) -> Array:
+        """Observations as rows of numbers, for regressions: ``[N, d]`` float64; states become one-hot."""
+        if isinstance(self.observation_space, spaces.Discrete):
+            first, size = int(self.observation_space.start), int(self.observation_space.n)
+            return np.eye(size)[np.asarray(observations, np.int64).reshape(-1) - first]
+        return np.asarray(observations, np.float64).reshape(len(observations), -1)
+
+
+def _limit_of(env: gym.Env[Any, Any]) -> TimeLimit[Any, Any] | None:
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, TimeLimit):
+            return inner
+        inner = inner.env
+    return None
+
+
+def open_world(env: Any) -> World:
+    """The world of an environment.
+
+    Args:
+        env: a Gymnasium id, "module:id", an environment, a class or function that makes one, a `FiniteMDP`, or the
+            mapping ``{"env": …, "env_kwargs": …}`` of a run.
+
+    Raises:
+        ValueError: it cannot be made, its actions are not `Discrete`, or its observations are composite.
+
+    Example:
+        >>> world = open_world("CartPole-v1")
+        >>> world.limit, world.liftable, world.num_actions, world.model is None
+        (500, True, 2, True)
+    """
+    handed = Handed(env["env"], dict(env.get("env_kwargs") or {})) if isinstance(env, Mapping) else handed_over(env)
+
+    def make() -> gym.Env[Any, Any]:
+        with standing_in(handed.make), refusals_name(handed.env), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return make_single(handed.env, handed.env_kwargs)
+
+    first = make()
+    try:
+        num_actions, first_action = discrete_actions(first.action_space)
+        space = first.observation_space
+        if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
+            raise ValueError(
+                f"observations must be of a Box or Discrete space, got {type(space).__name__}; wrap the environment "
+                f"with "
+                "gymnasium.wrappers.FlattenObservation"
+            )
+        found, spec = _limit_of(first), first.spec
+        limit = found._max_episode_steps if found is not None else None if spec is None else spec.max_episode_steps
+        return World(
+            name=handed.env, make=make, num_actions=num_actions, first_action=first_action, observation_space=space,
+            limit=limit, liftable=found is not None, model=_model(env, first), command=f"--env {handed.env}",
+        )  # fmt: skip
+    finally:
+        first.close()
+
+
+def _model(env: Any, made: gym.Env[Any, Any]) -> FiniteMDP | None:
+    if isinstance(env, FiniteMDP):
+        return env
+    with contextlib.suppress(Exception):  # there is none, or it is not this environment's
+        return FiniteMDP.from_gymnasium(made)
+    return None

@@ -1,0 +1,493 @@
+"""Every measurement of the doctor on a case whose right value is known in closed form, and on its healthy twin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from torch import nn
+
+from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam.case import CannotMeasure, Case, begin
+from neuralq.doctor.findings import Finding
+from neuralq.doctor.loading import load_subject
+from neuralq.doctor.play import Clock
+from neuralq.doctor.subject import Settings, of_network
+from neuralq.doctor.tree import decide
+from neuralq.doctor.worlds import open_world
+from neuralq.exact import solve
+from neuralq.mdp import FiniteMDP
+from neuralq.types import Array
+
+GAMMA = 0.9
+ENDS = 30  # steps after which the world ends
+
+Values = Callable[[Array], Any]
+
+
+class Counting(gym.Env[Any, Any]):
+    """Shows how many steps were made; ``pays(t, a)`` is the reward; ends, is cut or goes on as it is told."""
+
+    def __init__(
+        self,
+        pays: Callable[[int, int], float] = lambda t, a: 1.0,
+        ends: int | None = ENDS,
+        cuts: int | None = None,
+        shows: Callable[[int, np.random.Generator], list[float]] = lambda t, rng: [float(t)],
+    ) -> None:
+        self.pays, self.ends, self.cuts, self.shows = pays, ends, cuts, shows
+        width = len(shows(0, np.random.default_rng(0)))
+        self.observation_space = spaces.Box(-np.inf, np.inf, (width,), np.float64)
+        self.action_space = spaces.Discrete(2)
+
+    def _seen(self) -> Array:
+        return np.array(self.shows(self.t, self.np_random))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        paid = self.pays(self.t, int(action))
+        self.t += 1
+        return self._seen(), paid, self.t == self.ends, self.t == self.cuts, {}
+
+
+def case_of(
+    make: Callable[[], gym.Env[Any, Any]] | str,
+    subject: Any,
+    gamma: float = GAMMA,
+    settings: Settings | None = None,
+    data: Mapping[str, Array] | None = None,
+) -> Case:
+    world = open_world(make)
+    columns = None if data is None else stored.check_columns(data)
+    loaded = load_subject(subject)
+    return begin(loaded, world, gamma, settings or loaded.settings, columns, 0, Clock(60.0), lambda text: None)
+
+
+def both(value: Callable[[Array], Array]) -> Values:
+    """The same value for both actions."""
+    return lambda s: np.repeat(value(s[:, 0])[:, None], 2, axis=1)
+
+
+def worth(left: Array, gamma: float = GAMMA) -> Array:
+    """1 for ``left`` more steps."""
+    return np.asarray((1 - gamma ** np.maximum(left, 0)) / (1 - gamma))
+
+
+def ending(value: Callable[[Array], Array], **settings: Any) -> Case:
+    return case_of(lambda: Counting(**settings), both(value))
+
+
+def limited(value: Callable[[Array], Array], limit: int = 40) -> Case:
+    return case_of(lambda: TimeLimit(Counting(ends=None), limit), both(value))
+
+
+# V2, V4: values that are right, and a known share too high or too low.
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5, 0.5])
+def test_bias_is_the_share_by_which_values_are_too_high(factor: float) -> None:
+    case = ending(lambda t: factor * worth(ENDS - t))
+    g = worth(ENDS - np.arange(ENDS))
+    found = values.bias(case)
+    assert found.value == pytest.approx((factor - 1) * g.mean() / max(g.mean(), g.std()))
+    assert found.flagged == (factor != 1.0)
+    assert factor == 1.0 or ("over" in found.title) == (factor > 1)
+
+
+def test_returns_go_past_a_limit_that_can_be_lifted() -> None:
+    case = limited(lambda t: np.full(len(t), 1 / (1 - GAMMA)))
+    assert abs(values.bias(case).value) < 0.01  # what is missing is at most 1 % of the value
+    assert {one.within for one in case.greedy} == {40} and case.greedy[0].length > 40 and case.greedy[0].score == 40
+
+
+def test_without_lifting_only_steps_a_horizon_before_the_cut_count() -> None:
+    case = case_of(lambda: Counting(ends=None, cuts=60), both(lambda t: np.full(len(t), 10.0)))
+    found = values.bias(case)
+    assert -0.01 < found.value < 0.06 and not found.flagged  # 0.9^29 < 0.05
+    short = case_of(lambda: Counting(ends=None, cuts=20), both(lambda t: np.full(len(t), 10.0)))
+    with pytest.raises(CannotMeasure, match="cannot be lifted"):
+        values.bias(short)
+
+
+def test_no_value_may_exceed_what_any_return_can_be() -> None:
+    right, wrong = (limited(lambda t, f=f: np.full(len(t), f / (1 - GAMMA))) for f in (1.0, 3.0))  # type: ignore[misc]
+    assert values.soft_divergence(right).value == pytest.approx(1.0)
+    assert values.soft_divergence(wrong).value == pytest.approx(3.0)
+    assert not values.soft_divergence(right).flagged and values.soft_divergence(wrong).flagged
+
+
+# V1, V6a: an environment that pays for the action t mod 2.
+
+
+def alternating() -> gym.Env[Any, Any]:
+    return Counting(pays=lambda t, a: float(a == t % 2), ends=20)
+
+
+def on_the_beat(s: Array) -> Array:
+    return np.eye(2)[s[:, 0].astype(int) % 2]
+
+
+def test_a_policy_that_is_no_better_than_one_action_has_not_learned() -> None:
+    good, bad = (case_of(alternating, subject) for subject in (on_the_beat, lambda s: np.eye(2)[[0] * len(s)]))
+    assert values.has_learned(good).value == 20 and not values.has_learned(good).flagged
+    assert values.has_learned(bad).value == 10 and values.has_learned(bad).flagged
+    assert values.better_actions(good).value == 0 and not values.better_actions(good).flagged
+    wrong = case_of(alternating, lambda s: 1 - on_the_beat(s))
+    assert values.better_actions(wrong).value == 1 and values.better_actions(wrong).flagged
+
+
+# V5: reach.
+
+
+@pytest.mark.parametrize(("copies", "flagged"), [(5, True), (60, False)])
+def test_reach_is_the_share_that_so_many_copies_can_carry(copies: int, flagged: bool) -> None:
+    known = Settings(updates=100.0 * copies, target_period_updates=100.0)
+    case = case_of(lambda: TimeLimit(Counting(ends=None), 40), both(lambda t: t), settings=known)
+    assert values.reach(case).value == pytest.approx(1 - GAMMA**copies)
+    assert values.reach(case).flagged == flagged
+    ended = case_of(lambda: Counting(ends=4), both(lambda t: t), settings=known)  # 4 steps are all there is to see
+    assert values.reach(ended).value == pytest.approx(1.0) and not values.reach(ended).flagged
+
+
+def test_reach_counts_steps_of_targets_and_shares_of_copies() -> None:
+    assert Settings(updates=1000, target_period_updates=100, num_steps=3).steps_of_reach == 30
+    assert Settings(updates=1000, target_period_updates=1, tau=0.01).steps_of_reach == pytest.approx(10)
+    assert Settings(updates=1000, target_period_updates=100, lambda_=0.8).steps_of_reach == pytest.approx(50)
+    assert Settings(updates=1000).steps_of_reach is None
+
+
+# V3: values as a learner with each mistake would have them.
+
+
+def waves(t: int, a: int) -> float:
+    return float([3, 0, 1, 0, 0][t % 5])
+
+
+def summed(t: Array, pays: Callable[[int], float], steps: int = ENDS, gamma: float = GAMMA) -> Array:
+    """Σ γᵏ pays(t + k) up to the end, written out."""
+    return np.array([sum(gamma**k * pays(i + k) for k in range(max(steps - i, 0))) for i in t.astype(int).tolist()])
+
+
+MISTAKES: dict[str, Callable[[], Case]] = {
+    "γ = 0.5": lambda: ending(lambda t: worth(ENDS - t, 0.5)),
+    "the sign of rewards reversed": lambda: ending(lambda t: -worth(ENDS - t)),
+    "rewards times 0.1": lambda: ending(lambda t: 0.1 * worth(ENDS - t)),
+    "no end of episodes in the target": lambda: ending(lambda t: np.full(len(t), 1 / (1 - GAMMA))),
+    "the time limit taken for the end of the world": lambda: limited(lambda t: worth(40 - t)),
+    "rewards one step late": lambda: ending(lambda t: summed(t, lambda i: waves(i - 1, 0) if i else 0.0), pays=waves),
+    "rewards one step early": lambda: ending(
+        lambda t: summed(t, lambda i: waves(i + 1, 0) if i + 1 < ENDS else 0.0), pays=waves
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_each_mistake_is_named_by_the_values_it_makes(name: str) -> None:
+    found = hypotheses.hypotheses(MISTAKES[name]())
+    assert found.title.endswith(f"a learner with {name}") and found.flagged and found.value < 0.2
+
+
+def test_right_values_are_no_mistake_and_two_that_agree_are_not_told_apart() -> None:
+    assert not hypotheses.hypotheses(ending(lambda t: worth(ENDS - t))).flagged
+    assert not hypotheses.hypotheses(ending(lambda t: summed(t, lambda i: waves(i, 0)), pays=waves)).flagged
+    flat = hypotheses.hypotheses(limited(lambda t: np.full(len(t), 2.0)))  # γ = 0.5, or a fifth of every reward
+    assert not flat.flagged and "cannot tell" in flat.evidence
+
+
+def test_too_few_copies_are_not_taken_for_a_mistake() -> None:
+    known = Settings(updates=10, target_period_updates=10)
+    case = case_of(lambda: Counting(), both(lambda t: worth(ENDS - t, 0.5)), settings=known)
+    assert not hypotheses.hypotheses(case).flagged
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(1.0, GAMMA), (-1.0, GAMMA), (1.0, 0.5)])
+def test_the_equation_of_one_step_gives_the_scale_of_rewards_and_the_discount(alpha: float, beta: float) -> None:
+    found = hypotheses.one_step(ending(lambda t: alpha * summed(t, lambda i: waves(i, 0), gamma=beta), pays=waves))
+    assert found.value == pytest.approx(beta, abs=1e-6) and f"{alpha:.3f} r" in found.evidence
+    assert found.flagged == ((alpha, beta) != (1.0, GAMMA))
+
+
+# E1–E6: environments with a fault, and without.
+
+
+def test_a_broken_contract_is_said_in_words() -> None:
+    broken = Counting(shows=lambda t, rng: [math.nan if t == 3 else 0.0])
+    found = environment.contract(case_of(lambda: broken, both(lambda t: t)))
+    assert found.flagged and "NaN" in found.evidence
+    assert not environment.contract(ending(lambda t: t)).flagged
+
+
+def test_a_seed_that_decides_nothing_is_found() -> None:
+    unseeded = np.random.default_rng()
+    found = environment.determinism(case_of(lambda: Counting(shows=lambda t, rng: [unseeded.random()]), both(np.abs)))
+    assert found.flagged
+    seeded = case_of(lambda: Counting(shows=lambda t, rng: [rng.random()]), both(np.abs))
+    assert not environment.determinism(seeded).flagged
+
+
+def test_a_time_limit_reported_as_termination_is_told_from_a_real_end() -> None:
+    def noise(t: int, rng: np.random.Generator) -> list[float]:
+        return [rng.normal(), rng.normal()]
+
+    disguised = case_of(lambda: Counting(ends=30, shows=noise), both(np.abs))
+    honest = case_of(lambda: Counting(ends=None, cuts=30, shows=noise), both(np.abs))
+    shown = ending(lambda t: t)  # the last observation is told apart: it is the 30th
+    assert environment.disguised_limit(disguised).flagged
+    assert not environment.disguised_limit(honest).flagged
+    assert environment.disguised_limit(shown).value == 1 and not environment.disguised_limit(shown).flagged
+
+
+def test_scales_of_observations_and_rewards_are_measured() -> None:
+    uniform = case_of(lambda: Counting(shows=lambda t, rng: [100 * rng.random(), rng.random()]), both(np.abs))
+    found = environment.observation_scale(uniform)
+    assert found.value == pytest.approx(98, abs=1.5) and found.flagged  # 99 % of both entries: 98 % of the large one
+    small = case_of(lambda: Counting(shows=lambda t, rng: [rng.random()]), both(np.abs))
+    assert not environment.observation_scale(small).flagged and not environment.reward_scale(small).flagged
+    large = environment.reward_scale(ending(lambda t: t, pays=lambda t, a: -1000.0))
+    assert large.value == pytest.approx(1000 / (1 - GAMMA)) and large.flagged
+    never = environment.reward_scale(ending(lambda t: t, pays=lambda t, a: 0.0))
+    assert never.flagged and "sparse" in never.title
+
+
+ANGLE = 0.3
+
+
+class Turning(Counting):
+    """A point on a circle, turned by `ANGLE` each step; with one coordinate of two shown it hides where it goes."""
+
+    def __init__(self, entries: int) -> None:
+        super().__init__(shows=lambda t, rng: [0.0] * entries)
+        self.entries = entries
+
+    def _seen(self) -> Array:
+        if self.t == 0:
+            self.phase = self.np_random.uniform(0, 2 * math.pi)
+        at = self.phase + ANGLE * self.t
+        return np.array([math.cos(at), math.sin(at)][: self.entries])
+
+
+def test_what_is_hidden_is_what_the_past_tells_more() -> None:
+    """Var Δx = 1 − cos θ, of which x alone explains (1 − cos θ)² / 2, and with the step before all: (1 + cos θ) / 2."""
+    hides = aliasing.aliasing(case_of(lambda: Turning(1), both(np.abs)))
+    shows = aliasing.aliasing(case_of(lambda: Turning(2), both(np.abs)))
+    assert hides.value == pytest.approx((1 + math.cos(ANGLE)) / 2, abs=0.05) and hides.flagged
+    assert abs(shows.value) < 0.02 and not shows.flagged
+
+
+# R1–R6: networks with a known share of dead units, of known rank, fresh or moved.
+
+
+def two_layers(units: int, seed: int = 0) -> nn.Sequential:
+    net = nn.Sequential(nn.Linear(2, units), nn.ReLU(), nn.Linear(units, 2))
+    return network.fresh(net, np.random.default_rng(seed))  # type: ignore[return-value]
+
+
+def noisy() -> gym.Env[Any, Any]:
+    return Counting(shows=lambda t, rng: [rng.normal(), rng.normal()])
+
+
+def test_dormant_units_are_counted_and_fresh_networks_are_not_flagged() -> None:
+    net = two_layers(50)
+    healthy = network.dormant(case_of(noisy, net))
+    assert not healthy.flagged and abs(healthy.value) < 0.2
+    with torch.no_grad():
+        net[0].weight[:40] = 0.0  # type: ignore[index]
+        net[0].bias[:40] = -1.0  # type: ignore[index]
+        net[0].bias[40:] = 1.0  # type: ignore[index]
+    dead = network.dormant(case_of(noisy, net))
+    assert dead.flagged and "80 % of hidden units" in dead.evidence
+
+
+def test_effective_rank_of_units_that_all_say_the_same_is_one() -> None:
+    net = two_layers(50)
+    assert not network.effective_rank(case_of(noisy, net)).flagged
+    with torch.no_grad():
+        net[0].weight[:] = net[0].weight[0]  # type: ignore[index]
+        net[0].bias[:] = net[0].bias[0]  # type: ignore[index]
+    same = network.effective_rank(case_of(noisy, net))
+    assert same.value == 1 and same.flagged
+
+
+def test_weights_that_never_moved_are_known() -> None:
+    net = two_layers(50, seed=5)
+    assert network.untouched(case_of(noisy, net)).flagged
+    with torch.no_grad():
+        net[2].weight *= 3  # a third of them stays where all were
+    moved = network.untouched(case_of(noisy, net))
+    assert not moved.flagged and moved.value > 2
+
+
+def test_lag_is_relative_and_weights_that_are_not_finite_are_named() -> None:
+    net, late = two_layers(10), two_layers(10)
+    with torch.no_grad():
+        late[2].weight *= 0.25
+        late[2].bias *= 0.25
+    case = case_of(noisy, of_network(net, "x", target=late))
+    assert network.lag(case).value == pytest.approx(0.75) and network.lag(case).flagged
+    level = case_of(noisy, of_network(net, "x", target=two_layers(10)))
+    assert network.lag(level).value == 0 and not network.lag(level).flagged
+    with torch.no_grad():
+        net[2].bias[0] = math.nan
+    assert math.isnan(network.lag(case).value) and network.lag(case).flagged
+
+
+def test_churn_grows_with_the_step_and_leaves_the_subject_alone() -> None:
+    net = nn.Linear(2, 2)
+    with torch.no_grad():
+        net.weight[:], net.bias[:] = torch.tensor([[0.01, 0.0], [-0.01, 0.0]]), 0.0
+    before = [p.clone() for p in net.parameters()]
+    tiny, huge = (case_of(noisy, net, settings=Settings(learning_rate=rate)) for rate in (1e-9, 1.0))
+    assert network.churn(tiny).value == 0 and not network.churn(tiny).flagged
+    assert network.churn(huge).value > 0.1 and network.churn(huge).flagged
+    assert all(torch.equal(a, b) for a, b in zip(before, net.parameters(), strict=True))
+
+
+def test_the_kernel_says_of_w_to_2w_that_errors_grow() -> None:
+    """Tsitsiklis and Van Roy's: one weight, features 1 and 2; A = (…) is negative where 2 leads to 2 and γ > 5/6."""
+    net = nn.Linear(1, 2, bias=False)
+    with torch.no_grad():
+        net.weight[:] = 1.0
+
+    def steps(t: int, rng: np.random.Generator) -> list[float]:
+        return [1.0 if t == 0 else 2.0]
+
+    grows = network.kernel(case_of(lambda: Counting(ends=None, cuts=2, shows=steps), net, gamma=0.99))
+    shrinks = network.kernel(case_of(lambda: Counting(ends=None, cuts=2, shows=steps), net, gamma=0.5))
+    assert grows.flagged and grows.value < 0 and "target network" in grows.remedy
+    assert not shrinks.flagged and shrinks.value > 0
+
+
+@pytest.mark.slow
+def test_plasticity_of_a_fresh_network_is_that_of_a_fresh_network() -> None:
+    net = two_layers(600)
+    assert network.plasticity(case_of(noisy, net)).value == pytest.approx(1.0, abs=0.3)
+    with torch.no_grad():
+        net[0].weight[:] = 0.0  # type: ignore[index]
+        net[0].bias[:] = -1.0  # type: ignore[index]
+    assert network.plasticity(case_of(noisy, net)).flagged  # no unit of it can move any more
+
+
+# D1–D5: stored experience.
+
+
+def experience(num_episodes: int = 12, length: int = 50) -> dict[str, Array]:
+    t = np.tile(np.arange(length), num_episodes)
+    last = t == length - 1
+    rows = {"obs": t[:, None] * 1.0, "next_obs": t[:, None] + 1.0, "action": t % 2, "reward": t % 3 == 0}
+    return {**rows, "terminated": np.zeros(len(t), bool), "truncated": last}
+
+
+def stored_case(**changes: Array) -> Case:
+    make = lambda: TimeLimit(Counting(ends=None), 50)  # noqa: E731
+    return case_of(make, both(lambda t: t), data={**experience(), **changes})
+
+
+FAULTS: dict[str, tuple[Callable[[Case], Finding], dict[str, Array], float]] = {
+    "D1 both": (stored.merged_ends, {"terminated": experience()["truncated"]}, 12),
+    "D1 at the limit": (
+        stored.merged_ends,
+        {"terminated": experience()["truncated"], "truncated": np.zeros(600, bool)},
+        12,
+    ),
+    "D2": (stored.reset_leak, {"next_obs": np.roll(experience()["obs"], -1, axis=0)}, 11),
+    "D4": (stored.actions_taken, {"action": np.zeros(600, int)}, 1.0),
+    "D5": (stored.rewards_seen, {"reward": np.zeros(600)}, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_of_stored_data_is_counted_and_sound_data_are_not_flagged(name: str) -> None:
+    measure, changes, value = FAULTS[name]
+    found = measure(stored_case(**changes))
+    assert found.flagged and found.grade == "B" and found.value == pytest.approx(value)
+    assert not measure(stored_case()).flagged
+
+
+def test_a_buffer_that_holds_too_little_is_named_with_and_without_the_data() -> None:
+    assert not stored.window(stored_case()).flagged
+    few = {name: column[:60] for name, column in experience().items()}
+    assert stored.window(stored_case(**few)).flagged
+    small, large = (
+        case_of(lambda: Counting(), both(lambda t: t), settings=Settings(capacity=n)) for n in (60.0, 6000.0)
+    )
+    assert stored.window(small).flagged and not stored.window(large).flagged
+
+
+def test_a_missing_column_is_named_with_the_line_that_writes_it() -> None:
+    rows = experience()
+    del rows["truncated"]
+    with pytest.raises(ValueError, match=r"'truncated'.*numpy\.savez"):
+        stored.check_columns(rows)
+
+
+def test_errors_on_fresh_experience_are_compared_with_those_on_the_data() -> None:
+    """Q = t and reward 1: δ = 1 + γ(t + 1) − t on the data as on fresh steps; with values fitted to the data, more."""
+    case = stored_case(reward=np.ones(600))
+    assert values.generalisation(case).value == pytest.approx(1.0, abs=0.35)
+    learned = stored_case(reward=np.array([i - GAMMA * (i + 1) + 0.01 for i in experience()["obs"][:, 0]]))
+    assert values.generalisation(learned).flagged
+
+
+# V7: exactly.
+
+
+def test_exact_regret_is_nothing_for_the_best_values_and_what_it_is_for_others() -> None:
+    model = FiniteMDP.from_gymnasium(gym.make("FrozenLake-v1", is_slippery=False))
+    best = solve(model, GAMMA)
+    q = np.nan_to_num(best.q)
+    good = case_of(lambda: gym.make("FrozenLake-v1", is_slippery=False), lambda s: q[s])
+    assert exactly.regret(good).value == pytest.approx(0, abs=1e-9) and not exactly.regret(good).flagged
+    assert exactly.against_optimum(good).value == pytest.approx(0, abs=1e-6)
+    stays = case_of(lambda: gym.make("FrozenLake-v1", is_slippery=False), lambda s: np.eye(4)[[0] * len(s)] * 5)
+    start = float(model.start_distribution @ best.v)
+    assert exactly.regret(stays).value == pytest.approx(start / float(np.ptp(best.v))) and exactly.regret(stays).flagged
+    assert exactly.against_optimum(stays).value > 1 and exactly.against_optimum(stays).flagged
+
+
+# The decision.
+
+
+def flagged(name: str, cause: Any, grade: Any = "B", value: float = 1.0) -> Finding:
+    return Finding(name, name, cause, grade, value, flagged=True)
+
+
+def calm(name: str) -> Finding:
+    return Finding(name, name, "algorithm", "B", 0.0)
+
+
+def test_the_first_cause_comes_first() -> None:
+    def first(*found: Finding) -> str:
+        return decide(found)[0][0].id
+
+    wrong = flagged("V2", "algorithm")
+    assert first(wrong, flagged("V5", "algorithm"), flagged("E6", "environment")) == "E6"
+    assert first(wrong, flagged("V3", "algorithm"), flagged("V5", "algorithm")) == "V5"
+    assert first(wrong, flagged("D3", "data"), flagged("R1", "algorithm")) == "D3"
+    assert first(flagged("E4", "representation", "C", 1e4), wrong) == "E4"
+    assert first(flagged("E4", "representation", "C", 50.0), wrong) == "V2"  # beyond the threshold, not far beyond
+    assert first(flagged("X3", "algorithm", "A"), flagged("E6", "environment")) == "X3"
+
+
+def test_a_policy_that_has_learned_right_values_is_healthy_whatever_its_vital_signs_say() -> None:
+    found, headline = decide(
+        [calm("V1"), calm("V2"), calm("V4"), flagged("R1", "algorithm"), flagged("V5", "algorithm")]
+    )
+    assert {one.grade for one in found} == {"C"} and headline.startswith("Healthy")
+    found, headline = decide([calm("V1"), calm("V2"), flagged("D1", "data")])
+    assert found[0].grade == "B" and headline.startswith("Data")
+
+
+def test_what_no_measurement_explains_is_not_explained_away() -> None:
+    assert decide([flagged("V1", "algorithm"), calm("V2")])[1].startswith("Cannot tell the cause")
+    assert decide([])[1].startswith("Cannot tell")
