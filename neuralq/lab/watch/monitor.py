@@ -125,18 +125,17 @@ class DivergenceMonitor:
         self.traits = traits
         self.alarms: list[Alarm] = []
         self.diagnoses: list[tuple[int, SampleDiagnosis]] = []
-        self._given, self._margin = largest_reward, margin
+        self._given, self._margin, self._share = largest_reward, margin, share
         self._num_samples, self._every = num_samples, every
         self._rng = np.random.default_rng(seed)
         self._rows: deque[tuple[float, dict[str, float]]] = deque(maxlen=window)
         self._recent: Transition | None = None
         self._latest: SampleDiagnosis | None = None
         self._resumed = False
-        self._looks = self._next_kernel = self._kernels = 0
+        self._looks = self._next_kernel = self._kernels = self._env_steps = 0
         self._seen_bound = self._largest_value = self._run_seconds = 0.0
         self._value_now: float | None = None
         self._since_seconds: float | None = None
-        self._env_steps, self._share = 0, share
         self._look_seconds, self._kernel_seconds = _FIRST_LOOK_SECONDS, _FIRST_KERNEL_SECONDS
         self.cpu_seconds = 0.0
         """What it has cost so far."""
