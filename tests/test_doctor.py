@@ -135,7 +135,7 @@ def test_a_finding_says_itself_in_json_without_what_is_not_finite() -> None:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "q.pth"
-    torch.save(nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 2)).state_dict(), path)
+    torch.save(nn.Sequential(nn.Linear(4, 32), nn.ReLU(), nn.Linear(32, 2)).state_dict(), path)
     return path
 
 
