@@ -66,6 +66,9 @@ def test_what_moves_nothing_is_called_stable() -> None:
         assert (found.step_size_bound, found.oscillates, found.doubling_time, found.rank) == (math.inf, False, None, 0)
     seen = predict_expected_td(np.diag([3.0, 0.0, 1e-6]), 0.5)  # small is not nothing
     assert seen.rank == 2 and seen.eigenvalues.real == pytest.approx([1e-6, 3.0])
+    for size in (2, 4):  # rounding grows with the size of the matrix: up to 10⁻¹² of the largest for each row
+        for times, rank in ((0.9, size - 1), (1.1, size)):
+            assert predict_expected_td(np.diag([1.0] * (size - 1) + [times * size * 1e-12]), 0.5).rank == rank
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,11 @@ def test_the_problem_of_a_model() -> None:
     mass = DECAY * DENSE[:, ~MDP.is_terminal].sum(axis=1)
     assert (problem.reach, problem.least_modulus) == (1 / (1 - mass.max()), mass.min())
     assert problem.longest == np.diff(MDP.transition.indptr).max() and problem.largest_reward == 9.0
+    down, up = problem.least_modulus / (1 - problem.least_modulus), problem.reach - 1
+    assert problem.interval(-1.0, 2.0) == (-up, 2 * up) and problem.interval(1.0, 2.0) == (down, 2 * up)
+    assert problem.interval(-2.0, -1.0) == (-2 * up, -down) and problem.interval(0.0, 0.0) == (0.0, 0.0)
+    endless = prepare(FiniteMDP.from_arrays([[[1.0]]], [[0.0]]), 1.0)  # V = T V leaves no error there either
+    assert endless.reach == np.inf and endless.interval(0.0, 0.0) == (0.0, 0.0)
     assert problem.rounding(V) == (problem.longest + 4) * 2.0**-52 * (9 + 4)
 
 

@@ -5,12 +5,15 @@ Mutants that die here: the order of rows not undone, GMRES left out for columns 
 
 from __future__ import annotations
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 from scipy import sparse
 
 from neuralq.exact import resolvent, td_operator
 from neuralq.exact import resolvent as resolvent_function
+from neuralq.mdp import FiniteMDP
 
 
 def random_chain(n: int, branching: int, seed: int) -> sparse.csr_array:
@@ -62,3 +65,15 @@ def test_a_sparse_chain_gives_the_same_operator() -> None:
         A_dense, b_dense = td_operator(P.toarray(), r, X, d, 0.95, lambda_)
         assert A == pytest.approx(A_dense, rel=1e-10, abs=1e-13)
         assert b == pytest.approx(b_dense, rel=1e-10, abs=1e-13)
+
+
+def test_what_mixes_in_a_few_steps_is_iterated_to_its_end_without_help(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*args: object, **kwargs: object) -> None:
+        raise AssertionError("nothing is left for it")
+
+    module = import_module("neuralq.exact.resolvent")  # whose name is that of its function, too
+    monkeypatch.setattr(module, "gmres", refused)
+    chain = FiniteMDP.garnet(60, 1, 5, seed=0).transition
+    system = sparse.csr_array(sparse.eye_array(60) - 0.9 * chain)
+    right = np.random.default_rng(0).normal(size=(60, 40))  # more columns than one block has
+    assert module._iterate(system, right) == pytest.approx(np.linalg.solve(system.toarray(), right), rel=1e-10)

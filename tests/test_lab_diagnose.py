@@ -33,6 +33,7 @@ from neuralq_envs.counterexamples.chattering import chattering
 from neuralq_envs.counterexamples.kolter import kolter
 from neuralq_envs.counterexamples.spiral import spiral
 from neuralq_envs.counterexamples.split import a_split
+from neuralq_envs.counterexamples.walks import walk5
 
 
 def one_weight(gamma: float = 0.9, step_size: float = 0.1, reward: float = 1.0) -> Problem:
@@ -371,3 +372,11 @@ def test_what_is_as_far_as_the_bound_is_not_poor() -> None:
     assert not is_poor(0.0, 0.0, 0.0, 0.5) and not is_poor(1e-6, 0.0, 1.0, 0.5) and is_poor(1.1e-6, 0.0, 1.0, 0.5)
     assert not is_poor(1.15, 1.0, 0.0, 0.5) and is_poor(1.16, 1.0, 0.0, 0.5)  # 1/√.75 = 1.1547
     assert not any(is_poor(*args, 0.5) for args in ((None, 0.0, 0.0), (1.0, None, 0.0), (1.0, 0.0, None)))
+
+
+def test_the_bound_along_a_chain_is_that_of_the_chain_and_not_of_the_expected_update() -> None:
+    problem = walk5()
+    expected, along = (diagnose(problem, sampling=kind).step_size_bound for kind in ("expected", "markov"))  # type: ignore[arg-type]
+    assert expected is not None and along is not None and abs(along - expected) > 1e-3 * expected
+    radii = [diagnose(problem, step_size=x * along, sampling="markov").spectral_radius for x in (0.999, 1.001)]
+    assert radii[0] < 1 < radii[1]

@@ -311,3 +311,23 @@ def test_moments_agree_with_simulation(seed: int, sampling: str) -> None:
 @pytest.mark.parametrize("seed", range(3, 23))
 def test_moments_agree_with_long_simulation(seed: int) -> None:
     check_against_simulation(seed, "markov", 200_000)
+
+
+@pytest.mark.parametrize(("second_row_begins", "growth"), [(0.0, 0.5), (0.25, 2.0)])
+def test_rows_that_a_chain_never_comes_to_do_not_count(second_row_begins: float, growth: float) -> None:
+    # Two rows that lead to themselves: θ is halved in the first and doubled in the second, where the chain never is.
+    rows = np.array([0, 1])
+    D = np.array([1 - second_row_begins, second_row_begins])
+    maps = UpdateMaps(np.array([[[0.5]], [[2.0]]]), np.zeros((2, 1)), rows, rows, np.ones(2), D, np.array([1.0, 0.0]))
+    assert mean_radius(maps, "markov") == pytest.approx(growth)
+    assert second_moment_radius(maps, "markov") == pytest.approx(growth**2)
+    assert second_moment_stable(maps, "markov") == (growth < 1)
+    led = dataclasses.replace(maps, next_row=np.array([1, 1]))  # from the first row it comes to the second
+    assert mean_radius(led, "markov") == pytest.approx(2.0)
+
+
+def test_where_nothing_moves_nothing_grows() -> None:
+    still = UpdateMaps(np.ones((1, 1, 1)), np.zeros((1, 1)), np.zeros(1, int), np.zeros(1, int), *np.ones((3, 1)))
+    for sampling in ("iid", "markov"):
+        assert mean_radius(still, sampling) == second_moment_radius(still, sampling) == 0.0
+        assert len(growth_factors(still, sampling)) == 0 and second_moment_stable(still, sampling)

@@ -22,7 +22,7 @@ from gymnasium import spaces
 
 import neuralq
 from neuralq import RunConfig
-from neuralq.learners import TabularSettings
+from neuralq.learners import OnlineSettings, RolloutSettings, TabularSettings
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.control import evaluate_run
@@ -318,8 +318,12 @@ def test_r_learning_tells_the_reward_per_step() -> None:
 def played(config_: RunConfig, limit: int, gamma: float = 1.0) -> float:
     """Exact expected return of the greedy policy within the time limit, by backwards induction over the model."""
     mdp = FiniteMDP.from_gymnasium(gym.make(config_.env, **config_.env_kwargs), check=False)
-    session = walked(build_session(config_), config_.total_steps)
-    legal = session.learner.loop.table.q > -np.inf  # type: ignore[attr-defined]
+    session = build_session(config_)
+    while session.env_steps < config_.total_steps:
+        walked(session, config_.total_steps)
+    legal = mdp.legal
+    if callable(mask := getattr(gym.make(config_.env).unwrapped, "action_mask", None)):
+        legal = np.array([mask(s) != 0 for s in range(mdp.num_states)])
     entries = session.learner.engine.flat.values.numpy().reshape(legal.shape)
     rows = mdp.row_index[np.arange(mdp.num_states), np.where(legal, entries, -np.inf).argmax(1)]
     v = np.zeros(mdp.num_states)
@@ -365,3 +369,28 @@ def test_the_arithmetic_of_blackjack_is_that_of_the_game() -> None:
             returns.append(reward)
         error = np.std(returns) / 200
         assert abs(np.mean(returns) - blackjack_exact.value(choose)) < 3.5 * error
+
+
+def test_over_a_table_learners_have_step_sizes_of_their_own_unless_one_is_named() -> None:
+    ice = {"env": "FrozenLake-v1", "layout": "table"}
+    assert neuralq.with_preset({**ice, "learner": "online"}).online.step_size == 0.05  # type: ignore[union-attr]
+    named = neuralq.with_preset({**ice, "learner": "online", "online": {"step_size": 0.5}})
+    assert named == RunConfig(**ice, learner="online", online=OnlineSettings(step_size=0.5))
+    assert RunConfig(**ice).rollout.optimiser == "sgd" and RunConfig(env="FrozenLake-v1").rollout == RolloutSettings()
+    few = neuralq.with_preset({**ice, "rollout": {"num_envs": 2, "num_steps": 4}}).rollout
+    assert few is not None and (few.num_minibatches, few.learning_rate) == (1, 0.8)
+    many = neuralq.with_preset({**ice, "rollout": {"num_envs": 64, "num_minibatches": 1}}).rollout
+    assert many is not None and many.learning_rate == 1.0  # all samples may be of one entry
+    grid = neuralq.with_preset({"env": "neuralq/MitchellGrid-v0", "layout": "table"}).rollout
+    assert grid == neuralq.with_preset({"env": "neuralq/MitchellGrid-v0"}).rollout  # its preset names one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("learner", "env"), [
+    ("rollout", "FrozenLake-v1"), ("rollout", "CliffWalking-v1"), ("rollout", "Taxi-v4"), ("online", "CliffWalking-v1"),
+])  # fmt: skip
+def test_other_learners_learn_a_table_by_default(learner: str, env: str) -> None:
+    limit, least = {"FrozenLake-v1": (100, 0.7202), "CliffWalking-v1": (1000, -13.0), "Taxi-v4": (200, 7.0)}[env]
+    for seed in range(100, 102):
+        plain = {"env": env, "learner": learner, "layout": "table", "seed": seed, "exact": False, "resume_probe": False}
+        assert played(neuralq.with_preset(plain), limit) >= least

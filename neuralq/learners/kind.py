@@ -121,6 +121,8 @@ class LearnerKind:
         layout: of the representation where none is chosen.
         place: where it stands in lists; those of one number by name.
         step_sizes: settings that a run may go on with otherwise than it began.
+        on_table: ``on_table(given)``: defaults of settings over a table, where a sample moves one entry, so that a step
+            that suits the weights of a network is much too small; left out where a step size is given.
     """
 
     name: str
@@ -138,6 +140,20 @@ class LearnerKind:
     layout: str = "action-output"
     place: int = 100
     step_sizes: tuple[str, ...] = ()
+    on_table: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda given: {}
+
+    def settings_for(self, layout: str, given: Mapping[str, Any]) -> Any:
+        """The settings where some are given, for a layout.
+
+        Example:
+            >>> kind = learner_kinds()["online"]
+            >>> kind.settings_for("table", {}).step_size, kind.settings_for("linear", {}).step_size
+            (0.05, 0.001)
+            >>> kind.settings_for("table", {"step_size": 0.5}).step_size
+            0.5
+        """
+        own = self.on_table(given) if layout == "table" and not given.keys() & set(self.step_sizes) else {}
+        return self.settings(**{**own, **given})
 
     def __post_init__(self) -> None:
         """Refuse experience that no run hands out."""

@@ -224,6 +224,27 @@ def _build(parts: Parts) -> RolloutLearner:
     return RolloutLearner(parts.engine, settings, parts.rng, parts.reward_scale, total_updates)
 
 
+def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain steps that bring an entry a tenth nearer to each target of it, in small minibatches, and fall to 0.
+
+    An entry that all B samples of a minibatch are of moves by B tenths at most, which is kept below 1.
+    """
+    num_envs, num_steps = given.get("num_envs", 8), given.get("num_steps", 32)
+    rows = max(1, num_envs * num_steps)
+    minibatches = given.get("num_minibatches", max(1, rows // 8))
+    return {
+        "num_envs": num_envs,
+        "num_steps": num_steps,
+        "num_minibatches": minibatches,
+        "optimiser": "sgd",
+        "learning_rate": min(1.0, 0.1 * rows / max(1, minibatches)),
+        "max_grad_norm": None,
+        "anneal": True,
+        "returns": "watkins",
+        "lambda_": 0.5,
+    }
+
+
 ROLLOUT = LearnerKind(
     name="rollout",
     title="λ-returns over rollouts of parallel environments (PQN)",
@@ -235,4 +256,5 @@ ROLLOUT = LearnerKind(
     normalises=lambda s: (s.normalise_observations, False),
     place=1,
     step_sizes=("learning_rate",),
+    on_table=_on_table,
 )

@@ -44,7 +44,8 @@ def _named(config: Mapping[str, Any], hooks: Sequence[str]) -> list[tuple[str, s
     """What is imported for which part; whatever is no text is refused elsewhere."""
     body = config.get("body")
     named = {"environment": config.get("env"), "body": body.get("module") if isinstance(body, Mapping) else body}
-    parts = [*named.items(), *(("hook", hook) for hook in hooks)]
+    wrappers = [name for one in config.get("wrappers") or () for name in ([one] if isinstance(one, str) else one)]
+    parts = [*named.items(), *(("wrapper", name) for name in wrappers), *(("hook", hook) for hook in hooks)]
     found = [(what, name) for what, name in parts if isinstance(name, str)]
     return [(what, name.partition(":")[0]) for what, name in found if ":" in name]
 

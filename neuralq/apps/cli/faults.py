@@ -10,8 +10,8 @@ import site
 import sys
 import sysconfig
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 import gymnasium as gym
 import torch
@@ -88,13 +88,18 @@ def own_frame(error: BaseException) -> traceback.FrameSummary | None:
     cause: BaseException | None = error
     while cause is not None and id(cause) not in seen:
         seen.add(id(cause))
-        found = _innermost_own(cause.__traceback__) or found
+        found = _innermost_own(_frames(cause)) or found
         cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
     return found
 
 
-def _innermost_own(trace: TracebackType | None) -> traceback.FrameSummary | None:
-    frames = traceback.extract_tb(trace)
+def _frames(error: BaseException) -> Sequence[traceback.FrameSummary]:
+    """Of an error, also of one in another process."""
+    remote: Sequence[traceback.FrameSummary] = getattr(error, "remote_frames", ())
+    return remote or traceback.extract_tb(error.__traceback__)
+
+
+def _innermost_own(frames: Sequence[traceback.FrameSummary]) -> traceback.FrameSummary | None:
     return next((frame for frame in reversed(frames) if _is_own(frame.filename)), None)
 
 

@@ -20,7 +20,7 @@ from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
 from neuralq.runs.folder.files import replacing
 from neuralq.runs.loop import seed_for
-from neuralq.runs.recipe.games import make_single, refusals_name
+from neuralq.runs.recipe.environments import make_one
 from neuralq.runs.stream import faults_of, legal_actions
 
 if TYPE_CHECKING:
@@ -58,11 +58,12 @@ def make_shown(config: RunConfig, mode: str) -> gym.Env[Any, Any]:
         MissingExtra: if what it draws with is not installed.
         ValueError: if it cannot be made.
     """
-    with refusals_name(config.env):
-        try:
-            return make_single(config.env, config.env_kwargs, mode)
-        except gym.error.DependencyNotInstalled as error:
-            missing = error
+    try:
+        return make_one(config, mode)
+    except ValueError as error:
+        missing = error.__cause__
+        if not isinstance(missing, gym.error.DependencyNotInstalled):
+            raise
     raise MissingExtra(f"{config.env} cannot be drawn ({missing}); {_INSTALL}") from missing
 
 

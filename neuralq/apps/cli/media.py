@@ -24,6 +24,7 @@ from neuralq.runs.offline.files import write_recorded
 from neuralq.runs.offline.minari_files import write_minari
 from neuralq.runs.offline.recording import record_steps
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.recipe.environments import make_one
 from neuralq.runs.recipe.games import make_single, refusals_name
 
 __all__ = ["record", "watch"]
@@ -128,7 +129,7 @@ def _record_steps(options: argparse.Namespace) -> int:
     with same_folder() as here:  # environments may change it
         agent, limit = load(here / path, options.best), _limit(options, config)
         with refusals_name(config.env):
-            env = make_single(config.env, config.env_kwargs)
+            env = make_one(config)
         try:
             data = record_steps(env, agent, options.episodes, epsilon, options.seed, limit)
             if options.to is not None:

@@ -28,7 +28,7 @@ _EXAMPLES = """examples:
   neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
   neuralq train CartPole-v1 --print-config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
-_OWN_PARSING = {"env", "env_kwargs", "learner", "layout", "body", *LEARNERS}
+_OWN_PARSING = {"env", "env_kwargs", "wrappers", "learner", "layout", "body", *LEARNERS}
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,12 @@ def add_fields(
 
 _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ("env_kwargs", dict, "MAPPING", ENV_KWARGS),
+    (
+        "wrappers",
+        tuple[str | dict[str, Any], ...],
+        "LIST",
+        "wrappers around the environment, the first innermost: '[pkg:Wrapper, {pkg:Other: {size: 3}}]'",
+    ),
     (
         "body",
         dict | str | None,

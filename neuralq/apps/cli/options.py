@@ -8,7 +8,7 @@ import itertools
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 from neuralq.apps.cli import Failure
@@ -18,7 +18,7 @@ from neuralq.apps.cli.yaml_text import write_yaml
 from neuralq.q.bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.budget import cut_to_budget
-from neuralq.runs.recipe.config import LEARNERS, body_to_dict, config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import LEARNERS, body_to_dict, config_from_dict, config_to_dict, layout_for
 from neuralq.runs.recipe.presets import started, under, yielding
 from neuralq.runs.recipe.replay_presets import AGENTS
 
@@ -91,6 +91,14 @@ def _refuse_other_learners(argv: Sequence[str], learner: str) -> None:
             )
 
 
+def _shown(known: argparse.Namespace, preset: dict[str, Any]) -> dict[str, Any]:
+    """The defaults that help shows: over a table learners have some of their own."""
+    kind, own = LEARNERS[known.learner], preset.get(known.learner, {})
+    if layout_for(known.learner, str(known.layout)) != "table":
+        return preset
+    return {**preset, known.learner: asdict(kind.settings_for("table", own))}
+
+
 def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     """The configuration asked for and the other options; None where printing the options or that was all.
 
@@ -101,7 +109,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
     known, file, rest = _peek(argv)
     preset, origin = _preset(known)
     if {"-h", "--help"} & set(rest):
-        print(as_typed(train_parser(known.learner, preset).format_help()))
+        print(as_typed(train_parser(known.learner, _shown(known, preset)).format_help()))
         return None
     _refuse_other_learners(rest, known.learner)
     # A run has one learner, so that λ needs no place.

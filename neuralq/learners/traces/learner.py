@@ -253,4 +253,5 @@ ONLINE = LearnerKind(
     traits=lambda s: Traits(s.step_size, lambda_=s.lambda_),
     place=3,
     step_sizes=("step_size",),
+    on_table=lambda given: {"step_size": 0.05, "lambda_": 0.5},
 )

@@ -11,7 +11,7 @@ import numpy as np
 
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
-from neuralq.runs.recipe.games import make_single
+from neuralq.runs.recipe.environments import make_one
 from neuralq.runs.stream import faults_of, legal_actions
 from neuralq.types import Array
 
@@ -43,7 +43,7 @@ def played(config: RunConfig, agent: Agent) -> Played:
     Raises:
         EnvironmentFault: if the environment's own code fails.
     """
-    env = make_single(config.env, config.env_kwargs)
+    env = make_one(config)
     rng = np.random.default_rng(0)
     observations, masks, values = list[Any](), list[Any](), []
     try:

@@ -38,6 +38,7 @@ from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
 from neuralq.runs.stream.encoding import discrete_actions, encoder_for
 from neuralq.runs.stream.experience import ExperienceSource, ReplayExperience, RolloutExperience
 from neuralq.runs.stream.table import TableWalk
+from neuralq.runs.stream.workers import WorkerVectorEnv
 from neuralq.types import QFunction, Transition
 
 __all__ = [
@@ -238,7 +239,7 @@ def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
 
 
 def _probe(config: RunConfig, envs: Any, make: Callable[[], Any]) -> Resumability:
-    if not config.resume_probe:
+    if not config.resume_probe or isinstance(envs, WorkerVectorEnv):  # whose state is out of reach
         return untried(envs)
     return is_resumable(
         make,

@@ -15,6 +15,7 @@ from neuralq.checks import MOST_WHOLE, check_choice, check_discount, check_fract
 from neuralq.learners.kind import LearnerKind, learner_kinds
 from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom
 from neuralq.runs.recipe.games import is_screen
+from neuralq.runs.recipe.wrapping import check_wrappers
 
 __all__ = [
     "LAYOUTS",
@@ -73,6 +74,9 @@ class RunConfig:
     Args:
         env: Gymnasium id, or "module:id" to import a module that registers it.
         env_kwargs: passed to `gymnasium.make`.
+        wrappers: put around the environment, the first innermost: "module:Wrapper", or {"module:Wrapper": arguments}.
+        frame_stack: how many of the last observations are seen together.
+        vectorization: "sync", environments take turns; or "async", each has a process, for those that are slow.
         clip_rewards: whether training sees rewards clipped to between −1 and 1 (Mnih et al., 2015); Atari screens only.
         end_on_life_loss: whether in training a lost life ends the game and begins another; Atari screens only.
         learner: name of a learner; `neuralq.learners.learner_kinds` has them all.
@@ -109,6 +113,9 @@ class RunConfig:
 
     env: str = "CartPole-v1"
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    wrappers: tuple[str | dict[str, Any], ...] = ()
+    frame_stack: int = 1
+    vectorization: str = "sync"
     clip_rewards: bool = False
     end_on_life_loss: bool = False
     learner: str = "rollout"
@@ -173,7 +180,7 @@ class RunConfig:
         for name, kind in LEARNERS.items():
             given = getattr(self, name)
             if name == self.learner and given is None:
-                object.__setattr__(self, name, kind.settings())
+                object.__setattr__(self, name, kind.settings_for(self.layout, {}))
             elif name != self.learner and given is not None:
                 raise ValueError(
                     f"settings for the {name} learner would be ignored with learner={self.learner!r}; "
@@ -184,7 +191,7 @@ class RunConfig:
         _check_outputs(self)
         self.kind.check(self.settings, self)
         _check_exploration(self)
-        _check_game(self)
+        _check_environment(self)
         _check_dataset(self)
 
     @property
@@ -270,7 +277,10 @@ def _check_dataset(config: RunConfig) -> None:
         )
 
 
-def _check_game(config: RunConfig) -> None:
+def _check_environment(config: RunConfig) -> None:
+    check_choice("vectorization", config.vectorization, ("sync", "async"))
+    check_whole("frame_stack", config.frame_stack)
+    check_wrappers(config.wrappers)
     for name, way_out in (("clip_rewards", "use reward_scale"), ("end_on_life_loss", "leave it out")):
         if getattr(config, name) and not is_screen(config.env, config.env_kwargs):
             raise ValueError(f"{name} is for the screens of Atari games (ALE/...), got {config.env!r}; {way_out}")
@@ -315,7 +325,8 @@ def config_from_dict(plain: Mapping[str, Any]) -> RunConfig:
     _refuse_unknown("the configuration", values, RunConfig)
     for name, kind in LEARNERS.items():
         if values.get(name) is not None:
-            values[name] = kind.settings(**_fitted(name, values[name], kind.settings))
+            layout = layout_for(name, values.get("layout", RunConfig.layout))
+            values[name] = kind.settings_for(layout, _fitted(name, values[name], kind.settings))
     if values.get("body") is not None:
         body = _body_of(values["body"])
         check_choice("class of the body", body.get("class"), BODIES)

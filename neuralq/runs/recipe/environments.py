@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -12,8 +13,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.games import ATARI, make_single, own_maker, refusals_name, register_games
-from neuralq.runs.recipe.stand_in import stand_in
+from neuralq.runs.recipe.stand_in import Maker, stand_in, standing_in
+from neuralq.runs.recipe.wrapping import wrapped
 from neuralq.runs.stream import make_vector_env
+from neuralq.runs.stream.workers import make_worker_env
 from neuralq_envs import vector_twin
 
 __all__ = ["has_time_limit", "make_envs", "make_evaluation_envs", "make_one"]
@@ -36,26 +39,47 @@ def make_envs(config: RunConfig, num_envs: int, training: bool = False) -> Vecto
     Raises:
         ValueError: if the environment is not registered or cannot be made, with what to do about it.
     """
-    env_id = config.env.rpartition(":")[2]
-    register_games(env_id)
+    register_games(config.env.rpartition(":")[2])
     with refusals_name(config.env):
-        if stand_in() is not None or own_maker(config.env) is not None:  # which imports the module
-            return make_vector_env(lambda: make_single(config.env, config.env_kwargs), num_envs)
-        spec = gym.spec(env_id)
-        limit = config.env_kwargs.get("max_episode_steps")
-        twin = vector_twin(spec, config.env_kwargs) if limit in (None, -1) or _is_limit(limit) else None
-        if twin is not None:
-            return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
-        if (num_envs > 1 or spec.entry_point is None) and not env_id.startswith(ATARI):
-            vectorised = _own_vectorised(spec, config.env_kwargs, num_envs)
+        plain = not config.wrappers and config.frame_stack == 1 and stand_in() is None
+        if plain and own_maker(config.env) is None:  # which imports the module
+            vectorised = None if _in_processes(config, num_envs) else _vectorised(config, num_envs)
             if vectorised is not None:
                 return vectorised
-        clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
-        return make_vector_env(lambda: make_single(env_id, config.env_kwargs, None, clip, lives), num_envs)
+        make = partial(_single, config, training, stand_in())
+        return make_worker_env(make, num_envs) if _in_processes(config, num_envs) else make_vector_env(make, num_envs)
 
 
-def make_one(config: RunConfig) -> gym.Env[Any, Any]:
-    """The single environment that a learner trains in which takes its steps by itself.
+def _in_processes(config: RunConfig, num_envs: int) -> bool:
+    return config.vectorization == "async" and num_envs > 1
+
+
+def _single(config: RunConfig, training: bool, given: Maker | None) -> gym.Env[Any, Any]:
+    """One environment in its wrappers, in whichever process."""
+    with standing_in(given):
+        return make_one(config, training=training)
+
+
+def _vectorised(config: RunConfig, num_envs: int) -> VectorEnv[Any, Any, Any] | None:
+    """An implementation of many at once, where there is one."""
+    env_id = config.env.rpartition(":")[2]
+    spec = gym.spec(env_id)
+    limit = config.env_kwargs.get("max_episode_steps")
+    twin = vector_twin(spec, config.env_kwargs) if limit in (None, -1) or _is_limit(limit) else None
+    if twin is not None:
+        return gym.make_vec(twin[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **twin[1])
+    if (num_envs > 1 or spec.entry_point is None) and not env_id.startswith(ATARI):
+        return _own_vectorised(spec, config.env_kwargs, num_envs)
+    return None
+
+
+def make_one(config: RunConfig, render_mode: str | None = None, training: bool = False) -> gym.Env[Any, Any]:
+    """A single environment in its wrappers.
+
+    Args:
+        config: says which environment.
+        render_mode: how it is to be drawn, if at all.
+        training: as for `make_envs`.
 
     Raises:
         ValueError: as `make_envs`.
@@ -68,7 +92,9 @@ def make_one(config: RunConfig) -> gym.Env[Any, Any]:
     register_games(env_id)
     with refusals_name(config.env):
         own = stand_in() is not None or own_maker(config.env) is not None  # which imports the module
-        return make_single(config.env if own else env_id, config.env_kwargs)
+        clip, lives = (training and config.clip_rewards, training and config.end_on_life_loss)
+        env = make_single(config.env if own else env_id, config.env_kwargs, render_mode, clip, lives)
+        return wrapped(env, config.wrappers, config.frame_stack)
 
 
 def _is_limit(limit: Any) -> bool:

@@ -232,6 +232,8 @@ REACHED: dict[tuple[str, str], str] = {
     ("CartPole-v1", "streaming"): "500.0 (498.8 to 500.0)",
     ("Acrobot-v1", "streaming"): "−116.0 (−298.3 to −91.1)",
     ("MountainCar-v0", "streaming"): "−200 (−200 to −200)",
+    ("Acrobot-v1", "replay"): "−81.8 (−83.5 to −80.7)",
+    ("MountainCar-v0", "replay"): "−173.1 (−200.0 to −119.3)",
     ("MinAtar/Asterix-v1", "rollout"): "57.1",
     ("MinAtar/Breakout-v1", "rollout"): "29.0",
     ("MinAtar/Freeway-v1", "rollout"): "65.5",

@@ -57,6 +57,7 @@ class SubEnvFault(RuntimeError):
     def __init__(self, index: int, problem: str) -> None:
         super().__init__(f"environment {index}{problem}")
         self.index = index
+        self.problem = problem
 
 
 def what_it_did(error: BaseException) -> str:
