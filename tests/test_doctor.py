@@ -189,3 +189,27 @@ def test_the_command_exits_with_0_where_all_is_well(
     torch.save({"scale": torch.ones(1)}, "ones.pth")
     status = main(["doctor", "ones.pth", "--net", "ones:Net", "--env", "ones:World", "--gamma", "0"])
     assert status == 0 and "Healthy" in capsys.readouterr().out
+
+
+def test_a_run_that_misses_its_target_ends_with_three_findings_and_one_that_asks_with_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "train",
+        "CartPole-v1",
+        "--preset",
+        "false",
+        "--total-steps",
+        "64",
+        "--num-envs",
+        "2",
+        "--num-steps",
+        "16",
+    ]
+    command += ["--evaluation-episodes", "1", "--resume-probe", "false", "--stop-at-return", "475"]
+    assert main([*command, "--run-dir", str(tmp_path / "short")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("neuralq: doctor: [") == 3 and f"neuralq doctor {tmp_path / 'short'}" in said
+    assert "the target of 475 was not reached" in said
+    assert main(["train", "CartPole-v1", "--seeds", "2", "--doctor"]) == 2
+    assert "--doctor examines one run" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import re
+from pathlib import Path
 from typing import Any
 
 from neuralq.apps.cli import Failure, command_parser, print_result
@@ -17,9 +18,11 @@ from neuralq.doctor.examination import LEVELS, NUM_PARTS
 from neuralq.doctor.probes import probe as run_probes
 from neuralq.runs.folder.run_folder import is_run_folder
 
-__all__ = ["doctor", "probe"]
+__all__ = ["doctor", "examined", "probe"]
 
 
+_MINUTE, _MOMENT = 60.0, 4.0
+"""Seconds for the doctor at the end of a run, where it was asked for, and where the target was not reached."""
 _SUBJECT = (
     "a neuralq run folder; a zip of Stable-Baselines3 (DQN) or sb3-contrib (QR-DQN); a .cleanrl_model; a state dict "
     "(.pth, .safetensors, .npz)"
@@ -48,6 +51,23 @@ def doctor(argv: list[str]) -> int:
         say(f"report {page['report']}")
     print_result({**report.plain(), **page}, options.json, report.lines())
     return 0 if report.healthy else 1
+
+
+def examined(run: str | Path, whole: bool) -> list[str]:
+    """What the doctor says of a run that has just ended: all of it, or its three first findings in a line each.
+
+    Nothing where a short look is not possible: the run is whole without it.
+    """
+    try:
+        report = examine(run, budget_s=_MINUTE if whole else _MOMENT)
+    except (RuntimeError, ValueError, OSError) as error:
+        return [f"the doctor could not look at the run: {error}"] if whole else []
+    if whole:
+        return report.lines()
+    return [
+        *(f"doctor: {one.line()}" for one in report.findings[:3]),
+        f"all of it, with remedies: neuralq doctor {run}",
+    ]
 
 
 def probe(argv: list[str]) -> int:
