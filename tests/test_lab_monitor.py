@@ -3,11 +3,12 @@
 Mutants that die here: a kernel with its successors on the wrong side · successors after the end that count · the mean
 of the next values for their maximum · a bound without the discount · one that forgets the reward's scale, or takes an
 n-step reward for a step's · an alarm at every row · one for values that only rise to their level · a generator shared
-with the run · a look at padding rows.
+with the run · a look at padding rows · two monitors of one run, or none · more than its share of the CPU time.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import warnings
 from pathlib import Path
@@ -26,6 +27,7 @@ from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
 from neuralq.q import MLP, ActionOutputQ, LinearQ, TableQ
 from neuralq.runs import RunConfig, train
 from neuralq.runs import loop as training
+from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.stream.experience import Sample
 from neuralq.types import Transition
 from neuralq_envs.counterexamples import star
@@ -264,7 +266,7 @@ def test_padding_rows_are_not_looked_at_and_single_steps_are_collected() -> None
 def test_a_module_that_cannot_be_differentiated_this_way_stops_nothing() -> None:
     class Awkward(LinearQ):
         def at(self, s: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
-            return super().at(s, a) * (1.0 if float(s.sum()) > 0 else 2.0)
+            return torch.from_numpy(super().at(s, a).numpy())  # refused where a gradient is wanted
 
     monitor = DivergenceMonitor(TRAITS, every=1)
     monitor.observe(learner_of(Awkward(1, 1)), Sample(transitions([[1.0]] * 9, [[1.0]] * 9)))
@@ -303,6 +305,77 @@ def test_a_watched_run_ends_with_the_same_bits(kind: str, tmp_path: Path) -> Non
     json.dumps(monitor.report(), allow_nan=False)
     for _, found in monitor.diagnoses:
         assert np.isfinite([found.growth, found.min_real_eigenvalue, found.overlap, found.step_size_bound]).all()
+
+
+def test_every_run_is_watched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[DivergenceMonitor] = []
+    init = DivergenceMonitor.__init__
+    monkeypatch.setattr(
+        DivergenceMonitor, "__init__", lambda self, *a, **k: (made.append(self), init(self, *a, **k))[1]
+    )
+    config = CONFIGS["rollout"]
+    run = train(config, tmp_path / "watched")
+    assert len(made) == 1 and run.monitor is not None and run.monitor["alarms"] == []
+    assert "steps watched: no alarm" in run.monitor["seen"]
+    assert all(row["alarm"] is None for row in read_metrics(tmp_path / "watched"))
+    mine = DivergenceMonitor.of(config)  # as --hook neuralq.lab:DivergenceMonitor makes it
+    assert train(config, tmp_path / "twice", [mine]).monitor is not None and made[1:] == [mine]
+    alone = train(dataclasses.replace(config, monitor=False), tmp_path / "alone")
+    assert len(made) == 2 and alone.monitor is None and alone.parameters_sha256 == run.parameters_sha256
+    assert "alarm" not in read_metrics(tmp_path / "alone")[0]
+
+
+def test_unasked_it_spends_no_more_than_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that only its own work moves: looks cost 0.001 s, kernels 0.1 s, and the run 0.2 s between two rows."""
+    now = [0.0]
+    monkeypatch.setattr("neuralq.lab.watch.monitor.time.process_time", lambda: now[0])
+    monitor = DivergenceMonitor.sparing(RunConfig())
+    looks, kernels = [0], [0]
+
+    def observe(learner: Any, sample: Any) -> None:
+        looks[0] += 1
+        now[0] += 0.001
+        if monitor._affords(monitor._kernel_seconds):
+            kernels[0] += 1
+            monitor._kernels += 1
+            now[0] += 0.1
+
+    monkeypatch.setattr(monitor, "_observe", observe)
+    for k in range(1, 401):
+        monitor.observe(None, None)  # type: ignore[arg-type]
+        quiet(monitor, {**row(k), "cpu_seconds": 0.2 * k})
+        assert monitor.cpu_seconds <= 0.02 * 0.2 * k
+    assert looks[0] > 300 and 5 <= kernels[0] <= 16 and monitor.cpu_seconds > 0.01 * 80
+
+
+def test_what_was_said_is_remembered_by_a_resumed_run() -> None:
+    first = DivergenceMonitor(TRAITS, largest_reward=1.0, every=1)
+    assert quiet(first, row(1, max_q=50.0)) == ["soft divergence"]
+    first.observe(learner_of(LinearQ(1, 1)), Sample(w_to_2w_rows()))
+    quiet(first, row(1))
+    assert first.columns() == {"alarm": "soft divergence"} and first.verdict()["advice"][0] == "a target network"
+    again = DivergenceMonitor(TRAITS, largest_reward=1.0)
+    again.load_state_dict(first.state_dict())
+    assert again.verdict()["alarms"] == ["soft divergence"] and again.report()["kernels"] == first.report()["kernels"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again({**row(2, max_q=60.0), "cpu_seconds": 100.0})
+    assert len(again.alarms) == 1 and not again._run_seconds  # the hundred seconds were before it came
+
+
+def w_to_2w_rows() -> Transition:
+    return transitions([[1.0], [2.0]] * 4, [[2.0], [2.0]] * 4)
+
+
+def test_an_explosion_is_never_left_out_for_its_cost() -> None:
+    """What a fit would call explosive passes the cheap question before it, at the flattest curve that still is."""
+    monitor = DivergenceMonitor(RunTraits(gamma=1.0, step_size=0.1))
+    for k in range(20):
+        monitor._rows.append((float(k), {"abs_td_error": 10.0 ** (k / 19)}))
+    found = monitor.growth()
+    assert found is not None and found.rise == pytest.approx(10.0) and monitor._may_explode("abs_td_error")
+    monitor._rows.extend((float(k), {"abs_td_error": 1.0 + 0.01 * (k % 2)}) for k in range(20))
+    assert not monitor._may_explode("abs_td_error")
 
 
 def test_a_run_that_diverges_is_seen(tmp_path: Path) -> None:

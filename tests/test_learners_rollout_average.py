@@ -165,7 +165,7 @@ def test_annealing_that_would_be_ignored_is_refused(given: dict[str, Any]) -> No
 
 def test_normalised_observations_travel_with_the_run(tmp_path: Path) -> None:
     train(config_of(normalise_observations=True), tmp_path / "run")
-    agent = load(tmp_path / "run")
+    agent = load(tmp_path / "run", best=False)
     assert agent.normalisation is not None
     counted = agent.normalisation.state_dict()["observation_count"].item()
     assert counted >= 600, "one observation per step and environment"

@@ -14,7 +14,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import linprog
 from scipy.sparse.linalg import splu
 
 from neuralq.exact.kernels import Floats, look_ahead
@@ -100,6 +99,8 @@ def _check_ends(problem: PlanningProblem, decay: Floats, chosen: sparse.csr_arra
 
 def linear_programming(problem: PlanningProblem, tol: float, limit: float) -> Found:
     """The policy that the dual of the linear program puts its weight on, evaluated exactly."""
+    from scipy.optimize import linprog  # a fifth of a second, for this one method
+
     mdp, rows = problem.mdp, problem.rows
     every_row = np.arange(mdp.num_rows)
     chooses = sparse.csr_array((np.ones(mdp.num_rows), (every_row, mdp.s_tm1)), shape=mdp.transition.shape)

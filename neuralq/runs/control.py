@@ -42,6 +42,7 @@ from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.runs.warm_start import begun_from
+from neuralq.runs.watchers import monitor_verdict, watchers
 
 __all__ = ["CONTROL", "Run", "agent_of", "evaluate_run", "last_cap"]
 
@@ -69,6 +70,7 @@ class Run:
         exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
         measured: what it learned that is no value of an action: of prediction the start's value and the distance from
             exact values, of R-learning the reward per step; empty for others.
+        monitor: what the monitor of divergence says (`neuralq.lab.DivergenceMonitor.verdict`); None without it.
     """
 
     run_dir: Path
@@ -87,6 +89,7 @@ class Run:
     play_off: dict[str, Any] | None = None
     exact: dict[str, Any] | None = None
     measured: dict[str, float] = dataclasses.field(default_factory=dict)
+    monitor: dict[str, Any] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -108,7 +111,11 @@ class Run:
         ]
         if self.play_off is not None:
             lines.append(_about_play_off(self.play_off))
-        return lines if self.exact is None else [*lines, *Comparison(**self.exact).lines()]
+        if self.exact is not None:
+            lines += Comparison(**self.exact).lines()
+        if self.monitor is not None and self.monitor["alarms"]:
+            lines.append(f"it may have diverged ({', '.join(self.monitor['alarms'])}): {self.monitor['seen']}")
+        return lines
 
 
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
@@ -132,6 +139,7 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         play_off=play_off,
         exact=exact,
         measured=session.measures(),
+        monitor=monitor_verdict(progress.hook_states),
     )
 
 
@@ -140,7 +148,7 @@ def _about_play_off(found: Mapping[str, Any]) -> str:
     which = (
         "the best are the run's agent, --final takes the last"
         if found["agent"] == "best"
-        else "the last are the run's agent, for the difference may be chance; --best takes the others"
+        else "the last are the run's agent, for the best are not better beyond chance; --best takes them"
     )
     return (
         f"it ended below its best evaluation, at {found['best_env_steps']:,} steps; over {found['num_episodes']} fresh "
@@ -282,6 +290,8 @@ def _notes(config: RunConfig, latest: Mapping[str, Any]) -> list[str]:
             notes.append(f"{label} {latest[name]:.3g}")
     if "episode_return" in latest:
         notes.append(f"return {shown(latest['episode_return'])}")
+    if "alarm" in latest:
+        notes.append(f"may diverge: {latest['alarm']}")
     if "q_error_mean" in latest:
         notes.append(f"|Q − Q*| {latest['q_error_mean']:.3g}, regret {latest['regret']:.3g}")
     if "greedy_return" in latest:
@@ -315,4 +325,5 @@ CONTROL = Kind(
     changeable=_CHANGEABLE,
     opening=_opening,
     start=lambda config, session: config if config.warm_start is None else begun_from(config, session, _chosen),
+    watchers=watchers,
 )

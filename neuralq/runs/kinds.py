@@ -103,6 +103,7 @@ class Kind(Generic[C, T, R]):
         command: what the command line has to know to train by options of the kind's own.
         start: puts what was freshly built where its configuration says that a run begins; the configuration as it is
             to be kept.
+        watchers: of a configuration and the hooks that were given, what else watches a run, before them.
     """
 
     name: str
@@ -122,6 +123,7 @@ class Kind(Generic[C, T, R]):
     command: CommandLine | None = None
     opening: Callable[[C, T], list[str]] | None = None
     start: Callable[[C, T], C] = lambda config, trainee: config
+    watchers: Callable[[C, Sequence[Hook]], list[Hook]] | None = None
 
     def train(self, config: C, run_dir: str | Path | None = None, hooks: Sequence[Hook] = ()) -> R:
         """As `neuralq.train`."""
@@ -231,7 +233,8 @@ class Kind(Generic[C, T, R]):
                 say_to(hooks, line)
             if isinstance(trainee, Speaks):
                 trainee.say = functools.partial(say_to, hooks)
-            fit(trainee, plan, progress, folder, hooks, config)
+            watching = [] if self.watchers is None else self.watchers(config, hooks)
+            fit(trainee, plan, progress, folder, [*watching, *hooks], config)
         else:
             warnings.warn(_nothing_left(self, plan, progress, folder.named, reached), stacklevel=3)
         result = self.result(config, trainee, progress, folder)

@@ -355,6 +355,7 @@ class _Loop:
             "wall_seconds": progress.wall_seconds,
             **columns,
         }
+        self.watch.complete(row)
         self.folder.append_metrics(row)
         self.watch.row(row)
         if kind == "evaluation":

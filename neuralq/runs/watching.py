@@ -206,12 +206,22 @@ class Watch:
         self.stopped_by = self.stopped_by or f"the hook {self._calling}: {why}"
         self.request.ask()
 
+    def complete(self, row: dict[str, Any]) -> None:
+        """What hooks with ``columns`` add to a row, before it is written; they take it in first."""
+        self._show(row, {name: hook for name, hook in self.hooks.items() if _has_columns(hook)})
+        for hook in self.hooks.values():
+            if _has_columns(hook):
+                row |= {name: value for name, value in hook.columns().items() if name not in row}
+
     def row(self, row: Mapping[str, Any]) -> None:
         """A row of metrics to every hook that takes them, and the learner to those that look at it."""
         if self._rows is not None:
             self._rows.append(dict(row))
+        self._show(row, {name: hook for name, hook in self.hooks.items() if not _has_columns(hook)})
+
+    def _show(self, row: Mapping[str, Any], hooks: Mapping[str, Any]) -> None:
         observed = self.trainee.observed
-        for name, hook in self.hooks.items():
+        for name, hook in hooks.items():
             self._calling = name
             try:
                 if observed is not None and isinstance(hook, Observer):
@@ -260,6 +270,10 @@ class Watch:
         if self._watchable is not None:
             return self._watchable
         raise ValueError(f"runs of this kind show no {what} to hooks; session.metrics has what they measure")
+
+
+def _has_columns(hook: Any) -> bool:
+    return callable(getattr(hook, "columns", None))
 
 
 def _has_state(hook: Any) -> bool:

@@ -25,7 +25,7 @@ from torch import Tensor
 from neuralq.checks import check_positive
 from neuralq.exact import Prediction, predict_expected_td
 from neuralq.lab.networks.expected import QModule
-from neuralq.lab.networks.tangent_kernel import value_jacobian
+from neuralq.lab.networks.tangent_kernel import jacobian_of_few
 from neuralq.lab.plain import plain
 from neuralq.types import Floats, Transition
 
@@ -157,8 +157,8 @@ def diagnose_sample(
     goes_on = flat.discount_t.double() * torch.isfinite(v_t)
     v_t = v_t.masked_fill(goes_on == 0, 0.0)
     errors = reward_scale * flat.r_t.double() + goes_on * v_t - q_tm1
-    here = value_jacobian(q, flat.s_tm1, flat.a_tm1)
-    there = value_jacobian(q, flat.s_t, a_t) * (goes_on != 0).to(here.dtype)[:, None]
+    here = jacobian_of_few(q, flat.s_tm1, flat.a_tm1)
+    there = jacobian_of_few(q, flat.s_t, a_t) * (goes_on != 0).to(here.dtype)[:, None]
     kernel, ahead = ((x @ here.T).double().cpu().numpy() for x in (here, there))
     own, shared = np.diag(kernel), np.diag(ahead)
     moves = (goes_on.cpu().numpy() != 0) & (own > 0)

@@ -21,6 +21,7 @@ from neuralq_envs.counterexamples import Problem
 
 __all__ = [
     "LocalSystem",
+    "jacobian_of_few",
     "local_system",
     "local_verdict",
     "observations_of",
@@ -63,6 +64,25 @@ def value_jacobian(q: QModule, s: Tensor, a: Tensor) -> Tensor:
 
     rows = vmap(grad(value), in_dims=(None, 0, 0), chunk_size=_AT_ONCE)(parameters, s, a)
     return torch.cat([rows[name].reshape(len(s), -1) for name in parameters], dim=1)
+
+
+def jacobian_of_few(q: QModule, s: Tensor, a: Tensor) -> Tensor:
+    """As `value_jacobian`, by a backward pass for each row: quicker for a few dozen, and without what vmap must load.
+
+    Example:
+        >>> from neuralq.q import LinearQ
+        >>> jacobian_of_few(LinearQ(2, 1), torch.tensor([[3.0, 4.0]]), torch.tensor([0]))
+        tensor([[3., 4.]], dtype=torch.float64)
+    """
+    module = _At(q)
+    weights = {name: p.detach().requires_grad_() for name, p in module.named_parameters()}
+    with torch.enable_grad():
+        values = functional_call(module, weights, (s, a))
+        rows = [
+            torch.autograd.grad(one, list(weights.values()), retain_graph=True, materialize_grads=True)
+            for one in values
+        ]
+    return torch.stack([torch.cat([part.reshape(-1) for part in row]) for row in rows])
 
 
 def observations_of(problem: Problem, kind: Literal["features", "states"] = "features") -> Tensor:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 from neuralq.checks import check_discount, check_fraction, check_positive
-from neuralq.lab.networks.sampled import SampleDiagnosis
 from neuralq.runs import RunConfig
+
+if TYPE_CHECKING:
+    from neuralq.lab.networks.sampled import SampleDiagnosis
 
 __all__ = ["RunTraits", "advise"]
 

@@ -9,25 +9,26 @@ Three signs, from the surest to the earliest:
   and only a warning: what stabilises the run may be what the kernel leaves out. It must say so several times in a row.
 
 The monitor reads and never writes: it draws from a generator of its own, works on copies, and a run ends with the same
-bits with and without it.
+bits with and without it. It watches every training unasked (`DivergenceMonitor.sparing`), and then spends at most a
+fiftieth of the run's CPU time: what it would cost more is left out until the run has gone on long enough.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import time
 import warnings
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuralq.checks import check_positive, check_whole
-from neuralq.lab.networks.sampled import SampleDiagnosis, diagnose_sample
 from neuralq.lab.watch.advice import RunTraits, advise
 from neuralq.lab.watch.growth import GrowthFit, fit_growth
 from neuralq.learners import Learner
@@ -35,10 +36,16 @@ from neuralq.runs import RunConfig
 from neuralq.runs.stream.experience import Sample
 from neuralq.types import QFunction, Transition
 
+if TYPE_CHECKING:  # SciPy and torch.func are loaded when the first kernel is computed
+    from neuralq.lab.networks.sampled import SampleDiagnosis
+
 __all__ = ["Alarm", "DivergenceMonitor", "DivergenceWarning"]
 
 _PERSISTENT = 3  # unstable kernels in a row before the alarm: one may be chance
 _MOST_NUMBERS = 4e7  # entries of the Jacobians of a sample; a larger network gets a smaller sample
+_SHARE = 0.02  # of the CPU time of training
+_FIRST_KERNEL_SECONDS = 0.3  # what the first kernel is taken to cost, SciPy's import with it
+_FIRST_LOOK_SECONDS = 0.01
 _MEASURES = {"abs_td_error": "The mean TD error", "largest_value": "The largest |Q|"}
 
 
@@ -79,6 +86,8 @@ class DivergenceMonitor:
         every: rows of metrics between two kernels; each costs about 2 B gradients. 0 for none.
         window: rows over which growth is fitted.
         seed: of the generator that picks the transitions.
+        share: at most this share of the CPU time of training is spent, as far as rows of metrics tell it; None for as
+            much as it takes.
 
     Raises:
         ValueError: an argument out of range.
@@ -102,9 +111,11 @@ class DivergenceMonitor:
         every: int = 10,
         window: int = 20,
         seed: int = 0,
+        share: float | None = None,
     ) -> None:
-        if largest_reward is not None:
-            check_positive("largest_reward", largest_reward)
+        for name, value in (("largest_reward", largest_reward), ("share", share)):
+            if value is not None:
+                check_positive(name, value)
         if not margin >= 1:
             raise ValueError(f"margin must be at least 1, got {margin!r}")
         check_whole("num_samples", num_samples, 2)
@@ -114,17 +125,20 @@ class DivergenceMonitor:
         self.traits = traits
         self.alarms: list[Alarm] = []
         self.diagnoses: list[tuple[int, SampleDiagnosis]] = []
-        self._given, self._margin = largest_reward, margin
+        self._given, self._margin, self._share = largest_reward, margin, share
         self._num_samples, self._every = num_samples, every
         self._rng = np.random.default_rng(seed)
         self._rows: deque[tuple[float, dict[str, float]]] = deque(maxlen=window)
         self._recent: Transition | None = None
         self._latest: SampleDiagnosis | None = None
-        self._looks = 0
-        self._seen_bound = 0.0
+        self._resumed = False
+        self._looks = self._next_kernel = self._kernels = self._env_steps = 0
+        self._seen_bound = self._largest_value = self._run_seconds = 0.0
         self._value_now: float | None = None
-        self._largest_value = 0.0
-        self._env_steps = 0
+        self._since_seconds: float | None = None
+        self._look_seconds, self._kernel_seconds = _FIRST_LOOK_SECONDS, _FIRST_KERNEL_SECONDS
+        self.cpu_seconds = 0.0
+        """What it has cost so far."""
         self.unavailable: str | None = None
         """Why there is no kernel, where there is none."""
 
@@ -138,6 +152,16 @@ class DivergenceMonitor:
         """
         return cls(RunTraits.of(config), largest_reward=largest_reward)
 
+    @classmethod
+    def sparing(cls, config: RunConfig) -> DivergenceMonitor:
+        """The monitor that every training has: it spends at most a fiftieth of the CPU time of training.
+
+        Example:
+            >>> DivergenceMonitor.sparing(RunConfig()).columns()
+            {'alarm': None}
+        """
+        return cls(RunTraits.of(config), share=_SHARE)
+
     @property
     def bound(self) -> float | None:
         """r_max / (1 − γ), in the learner's units; None without a reward or without discounting."""
@@ -149,6 +173,23 @@ class DivergenceMonitor:
 
     def observe(self, learner: Learner, sample: Sample) -> None:
         """Read the learner's Q-function on what it last learned from; called by `neuralq.train` before each row."""
+        if not self._affords(self._look_seconds):
+            self._value_now = None
+            return
+        began, kernels = time.process_time(), self._kernels
+        self._observe(learner, sample)
+        spent = time.process_time() - began
+        self.cpu_seconds += spent
+        if self._kernels == kernels:
+            self._look_seconds = spent
+        else:
+            self._kernel_seconds = spent
+
+    def _affords(self, seconds: float) -> bool:
+        """Whether so much more is within its share."""
+        return self._share is None or self.cpu_seconds + seconds <= self._share * self._run_seconds
+
+    def _observe(self, learner: Learner, sample: Sample) -> None:
         rows = _held_rows(sample)
         if not len(rows.a_tm1):
             return
@@ -165,8 +206,11 @@ class DivergenceMonitor:
         self._recent = rows
         q = learner.engine.q
         self._value_now = _largest_value(q, rows)
-        if self._every and self._looks % self._every == 0 and len(rows.a_tm1) >= min(self._num_samples, 8):
+        due = self._every and self._looks >= self._next_kernel and len(rows.a_tm1) >= min(self._num_samples, 8)
+        if due and self._affords(self._kernel_seconds):
             self._latest = self._try_inspect(q, rows)
+            self._kernels += 1
+            self._next_kernel = self._looks + self._every
         self._looks += 1
 
     def inspect(self, q: QFunction, transitions: Transition, env_steps: int | None = None) -> SampleDiagnosis:
@@ -180,6 +224,8 @@ class DivergenceMonitor:
         Raises:
             ValueError: fewer than 2 transitions.
         """
+        from neuralq.lab.networks.sampled import diagnose_sample
+
         found = diagnose_sample(
             cast(nn.Module, q), transitions, self.traits.step_size, reward_scale=self.traits.reward_scale
         )
@@ -188,6 +234,15 @@ class DivergenceMonitor:
 
     def __call__(self, row: Mapping[str, Any]) -> None:
         """Take in a row of metrics and raise what alarms are due."""
+        began = time.process_time()
+        self._take_row(row)
+        self.cpu_seconds += time.process_time() - began
+        if "cpu_seconds" in row:
+            if self._since_seconds is None:  # a resumed run has trained before
+                self._since_seconds = float(row["cpu_seconds"]) if self._resumed else 0.0
+            self._run_seconds = float(row["cpu_seconds"]) - self._since_seconds
+
+    def _take_row(self, row: Mapping[str, Any]) -> None:
         self._env_steps = int(row.get("env_steps", self._env_steps))
         latest, self._latest = self._latest, None
         if latest is not None:
@@ -224,17 +279,31 @@ class DivergenceMonitor:
             )
 
     def _check_growth(self, name: str) -> None:
-        found, bound = self.growth(name), self.bound
-        if found is None or not found.explosive or len(self._rows) < (self._rows.maxlen or 0):
+        bound = self.bound
+        if len(self._rows) < (self._rows.maxlen or 0):
             return
         if bound is not None and self._rows[-1][1].get(name, 0.0) < 0.1 * bound:
             return  # values that start at 0 have to grow
+        if not self._may_explode(name):
+            return
+        found = self.growth(name)
+        if found is None or not found.explosive:
+            return
         doubling = found.doubling or math.inf
         self._raise(
             f"growth of {name}",
             f"{_MEASURES[name]} rose {found.rise:.3g}-fold over the last {len(self._rows)} rows without "
             f"slowing down: it doubles every {doubling:.3g} updates.",
         )
+
+    def _may_explode(self, name: str) -> bool:
+        """Whether a fit is worth its cost: a tenfold rise of the fitted curve takes a spread of the values.
+
+        Var log y ≥ Var of the fit, whose two ends, ln 10 apart, alone make it (ln 10)²/(2n); and a range is at least
+        twice a standard deviation.
+        """
+        kept = [row[name] for _, row in self._rows if row.get(name, 0.0) > 0]
+        return len(kept) > 1 and max(kept) >= min(kept) * math.exp(2 * math.log(10) / math.sqrt(2 * len(kept)))
 
     def growth(self, measure: str = "abs_td_error") -> GrowthFit | None:
         """The geometric curve through the last rows of "abs_td_error" or "largest_value", per update."""
@@ -260,6 +329,8 @@ class DivergenceMonitor:
             warnings.warn(f"after {self._env_steps:,} steps: {alarm}", DivergenceWarning, stacklevel=3)
 
     def _try_inspect(self, q: QFunction, rows: Transition) -> SampleDiagnosis | None:
+        from neuralq.lab.networks.sampled import diagnose_sample
+
         module = cast(nn.Module, q)
         size = sum(p.numel() for p in module.parameters())
         few = max(2, min(len(rows.a_tm1), int(_MOST_NUMBERS / (2 * size))))
@@ -279,6 +350,44 @@ class DivergenceMonitor:
         # A row of n steps is discounted by γⁿ: |Σ γᵏ r| / (1 − γⁿ) ≤ r_max / (1 − γ).
         share = torch.where(rows.discount_t > 0, 1 - rows.discount_t.double(), 1 - gamma)
         self._seen_bound = max(self._seen_bound, float((size / share.clamp(min=1 - gamma)).max()))
+
+    def columns(self) -> dict[str, Any]:
+        """What rows of metrics are to say: the alarms so far, by kind, or None."""
+        return {"alarm": ", ".join(alarm.kind for alarm in self.alarms) or None}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it has to remember: alarms, the rows that growth is fitted on, bounds, and what to say of it all."""
+        return {
+            "alarms": [asdict(alarm) for alarm in self.alarms],
+            "rows": [[at, dict(row)] for at, row in self._rows],
+            "largest_value": self._largest_value,
+            "seen_bound": self._seen_bound,
+            "kernels": [{"env_steps": at, **asdict(one)} for at, one in self.diagnoses[-_PERSISTENT:]],
+            "verdict": self.verdict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict`; what was said already is not said again."""
+        self._resumed = True
+        self.alarms = [Alarm(**{**one, "advice": tuple(one["advice"])}) for one in state["alarms"]]
+        self._rows.extend((float(at), dict(row)) for at, row in state["rows"])
+        self._largest_value, self._seen_bound = float(state["largest_value"]), float(state["seen_bound"])
+        if state["kernels"]:
+            from neuralq.lab.networks.sampled import SampleDiagnosis
+
+            kept = [dict(one) for one in state["kernels"]]
+            self.diagnoses = [(one.pop("env_steps"), SampleDiagnosis(**one)) for one in kept]
+
+    def verdict(self) -> dict[str, Any]:
+        """In short, as plain values: "alarms" by kind, what was "seen", the "advice", and the CPU seconds it "cost"."""
+        return {
+            "alarms": [alarm.kind for alarm in self.alarms],
+            "seen": self.explain(),
+            "advice": list(self.alarms[-1].advice) if self.alarms else [],
+            "largest_value": self._largest_value / self.traits.reward_scale,
+            "bound": None if self.bound is None else self.bound / self.traits.reward_scale,
+            "cpu_seconds": self.cpu_seconds,
+        }
 
     def report(self) -> dict[str, Any]:
         """What was seen, as plain values for JSON."""

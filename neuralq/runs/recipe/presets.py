@@ -7,6 +7,7 @@ from typing import Any
 
 from neuralq.checks import check_choice
 from neuralq.q.bodies import NAMED_BODIES
+from neuralq.rules.target_rule import target_rules
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for
 from neuralq.runs.recipe.games import ATARI
@@ -250,6 +251,9 @@ _YIELDS = {
 }
 """What of a preset gives way to a setting that is given."""
 
+_OF_FROZEN_TARGETS = {"target_period_updates", "target_rate", "average_updates", "noisy", "loss"}
+"""What gives way to a rule that corrects the gradient instead of freezing its targets, and takes none of it."""
+
 
 def preset_for(env: str, learner: str) -> dict[str, Any]:
     """The preset's values: of the environment, else of any environment, empty where the learner has none.
@@ -324,8 +328,13 @@ def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
     Example:
         >>> yielding({"target_period_updates": 250, "learning_rate": 1e-3}, {"target_rate": 0.01})
         {'learning_rate': 0.001}
+        >>> yielding({"average_updates": 1000.0, "noisy": True}, {"target_rule": "dqrc"})
+        {}
     """
     gone = {over for name, overs in _YIELDS.items() if name in given for over in overs}
+    rule = target_rules().get(given.get("target_rule", ""))
+    if rule is not None and rule.correction:
+        gone |= _OF_FROZEN_TARGETS
     return {name: value for name, value in settings.items() if name not in gone}
 
 
