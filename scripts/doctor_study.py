@@ -26,7 +26,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.wrappers import TimeLimit, TransformObservation, TransformReward
+from gymnasium.wrappers import TransformObservation, TransformReward
 from torch import nn
 
 from neuralq.doctor import Settings, examine
@@ -200,11 +200,11 @@ DISEASES: dict[str, Disease] = {
     "15": Disease("buffer of 100", ("data",), "D3", plan=Plan(buffer=100, starts=100), sb3={"buffer_size": 100}),
     "16": Disease("reward noise σ = 5", ("algorithm",), "V2", plan=Plan(noise=5.0)),
 }  # fmt: skip
-HEALTHY: dict[str, Maker] = {
-    "CartPole": cartpole,
-    "Acrobot": lambda: gym.make("Acrobot-v1"),
-    "MountainCar": lambda: gym.make("MountainCar-v0"),
-    "FrozenLake": lambda: TimeLimit(gym.make("FrozenLake-v1", is_slippery=False, max_episode_steps=-1), LIMIT),
+HEALTHY: dict[str, dict[str, Any]] = {
+    "CartPole-v1": {"stop_at_return": 475},
+    "Acrobot-v1": {},
+    "MountainCar-v0": {},
+    "FrozenLake-v1": {"env_kwargs": {"is_slippery": False}},
 }
 ZOO = {
     "learning_rate": 2.3e-3, "batch_size": 64, "buffer_size": 100_000, "learning_starts": 1000, "train_freq": 256,
@@ -256,8 +256,8 @@ def healthy(env: str, seed: int, budget_s: float) -> dict[str, Any]:
     import neuralq
 
     with tempfile.TemporaryDirectory() as folder:
-        run = neuralq.train(HEALTHY[env], Path(folder) / "run", seed=seed, resume_probe=False)
-        report = examine(run.run_dir, HEALTHY[env], gamma=GAMMA, budget_s=budget_s, seed=seed)
+        run = neuralq.train(env, Path(folder) / "run", seed=seed, resume_probe=False, **HEALTHY[env])
+        report = examine(run.run_dir, budget_s=budget_s, seed=seed)
     named = [one.id for one in report.findings if one.grade in "AB"]
     return {
         "disease": "healthy", "name": env, "seed": seed, "trainer": "neuralq", "expected": [None],

@@ -194,19 +194,9 @@ def test_the_command_exits_with_0_where_all_is_well(
 def test_a_run_that_misses_its_target_ends_with_three_findings_and_one_that_asks_with_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [
-        "train",
-        "CartPole-v1",
-        "--preset",
-        "false",
-        "--total-steps",
-        "64",
-        "--num-envs",
-        "2",
-        "--num-steps",
-        "16",
-    ]
-    command += ["--evaluation-episodes", "1", "--resume-probe", "false", "--stop-at-return", "475"]
+    command = ["train", "CartPole-v1", "--preset", "false", "--total-steps", "64", "--rollout.num-envs", "2"]
+    command += ["--rollout.num-steps", "16", "--evaluation-episodes", "1", "--resume-probe", "false"]
+    command += ["--stop-at-return", "475"]
     assert main([*command, "--run-dir", str(tmp_path / "short")]) == 1
     said = capsys.readouterr().err
     assert said.count("neuralq: doctor: [") == 3 and f"neuralq doctor {tmp_path / 'short'}" in said
