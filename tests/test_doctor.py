@@ -168,22 +168,22 @@ def test_the_command_exits_with_0_where_all_is_well(
     (tmp_path / "ones.py").write_text(
         "import gymnasium, numpy, torch\n"
         "class World(gymnasium.Env):\n"
-        "    observation_space = gymnasium.spaces.Box(0, 1, (1,))\n"
+        "    observation_space = gymnasium.spaces.Box(0, 1, (2,))\n"
         "    action_space = gymnasium.spaces.Discrete(2)\n"
         "    def reset(self, *, seed=None, options=None):\n"
         "        super().reset(seed=seed)\n"
         "        self.t = 0\n"
-        "        return numpy.zeros(1, numpy.float32), {}\n"
+        "        return numpy.zeros(2, numpy.float32), {}\n"
         "    def step(self, action):\n"
         "        paid = float(action == self.t % 2)\n"
         "        self.t += 1\n"
-        "        return numpy.full(1, self.t % 2, numpy.float32), paid, self.t == 9, False, {}\n"
+        "        return numpy.array([self.t % 2, self.t / 9], numpy.float32), paid, self.t == 9, False, {}\n"
         "class Net(torch.nn.Module):\n"
         "    def __init__(self):\n"
         "        super().__init__()\n"
         "        self.scale = torch.nn.Parameter(torch.ones(1))\n"
         "    def forward(self, x):\n"
-        "        return self.scale * torch.cat([1 - x, x], dim=1)\n"
+        "        return self.scale * torch.cat([1 - x[:, :1], x[:, :1]], dim=1)\n"
     )
     monkeypatch.chdir(tmp_path)
     torch.save({"scale": torch.ones(1)}, "ones.pth")
