@@ -81,7 +81,7 @@ def test_the_numbers_are_those_by_hand() -> None:
     one.see(np.array([0, 1]), np.array([1, 0]))
     found = one.compare(table([10.0, 30.0], [70.0, 20.0], [1e9, 0.0]), scale=10.0)
     assert found is not None and (found.q_error_max, found.q_error_mean, found.optimal_share) == (2.0, 3 / 2, 0.5)
-    assert "the greedy policy loses 3 of it" in "; ".join(found.lines())
+    assert "the greedy policy earns 3 less than an optimal one" in "; ".join(found.lines())
 
 
 def test_right_values_have_no_error_and_no_regret() -> None:

@@ -132,7 +132,7 @@ def test_a_stop_is_saved_evaluated_told_and_can_be_resumed_bit_for_bit(
     assert run.interrupted_by is None and read_summary(run.run_dir)["stopped_by"] == run.stopped_by
     assert read_metrics(run.run_dir)[-1]["kind"] == "evaluation" and run.greedy_return is not None
     states = load_newest(run.run_dir / "checkpoints").state["hooks"]
-    assert {name: state["count"] for name, state in states.items()} == {
+    assert {name: state["count"] for name, state in states.items() if "count" in state} == {
         f"{__name__}:Counting": 24,
         f"{__name__}:Counting #2": 24,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["instead_of"]
 
 _TRAIN = 'neuralq.train("CartPole-v1", learner="replay")'
-_NO_POLICY_GRADIENT = f"there are no policy gradients here; a value function is trained by {_TRAIN}"
+_NO_POLICY_GRADIENT = f"{_TRAIN}, which trains a value function: there are no policy gradients here"
 _MAKE = 'gymnasium.make("CartPole-v1"), which neuralq.train and neuralq.solve take'
 _INSTEAD = {
     **dict.fromkeys(("DQN", "DQNPolicy", "DQNAgent", "DoubleDQN", "Rainbow", "RainbowPolicy"), _TRAIN),
