@@ -285,11 +285,10 @@ def network_verdict(num_problems: int, seed: int = 0) -> dict[str, Any]:
             q = layout((3,), 2, body=MLP(hidden=(16,)), rng=i, dtype=torch.float64)
             seen = observations_of(problem)
             found = diagnose_network(q, problem, 0.05, observations=seen, curvature=False)
-            first = last = expected_backup(problem, seen, state_values=False)
-            del first
+            backup = expected_backup(problem, seen, state_values=False)
             before = found.largest_error
             for _ in range(500):
-                expected_td_step(q, last, 0.05)
+                expected_td_step(q, backup, 0.05)
             after = diagnose_network(q, problem, 0.05, observations=seen, curvature=False).largest_error
             rows.append((found.kernel_growth, bool(not np.isfinite(after) or after > 2 * before), layout.__name__))
     growth, diverged = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])

@@ -75,7 +75,7 @@ def run_experiments(case: Case, named: Sequence[Finding], seeds: int, say: Calla
         say(f"experiment X3: {repair.title}")
         _try(found, "X3", lambda: _repaired(plan, repair, baseline))
     say("experiment X1: their algorithm and body, and ours")
-    _try(found, "X1", lambda: _factorial(plan, found, baseline))
+    _try(found, "X1", lambda: _factorial(plan, found))
     return found
 
 
@@ -163,7 +163,6 @@ def _regressed(
         torch.autograd.backward(error)
         nn.utils.clip_grad_norm_(net.parameters(), 10.0)
         optimiser.step()
-    del rng
     with torch.no_grad():
         left = (values(net).gather(1, chosen)[:, 0] - target)[torch.as_tensor(held)].double()
     variance = float(target[torch.as_tensor(held)].double().var(correction=0))
@@ -316,7 +315,7 @@ def _difference(more: Sequence[float], less: Sequence[float]) -> tuple[float, fl
     return float(low), float(high)
 
 
-def _factorial(plan: _Plan, found: Experiments, baseline: list[float]) -> list[Finding]:
+def _factorial(plan: _Plan, found: Experiments) -> list[Finding]:
     steps = plan.steps_for(4 * plan.seeds)
     case = plan.case
     ours = {"learner": "rollout", "normalise_observations": False}
@@ -326,7 +325,6 @@ def _factorial(plan: _Plan, found: Experiments, baseline: list[float]) -> list[F
     for i, (body, make) in enumerate(((plan.their_body(), None), (wide, normalised))):
         for j, algorithm in enumerate((plan.theirs(), ours)):
             cells[i, j] = [plan.run({**algorithm, **body}, 100 + seed, steps, make) for seed in range(plan.seeds)]
-    del baseline
     found.factorial = np.array([[np.mean(cells[i, j]) for j in (0, 1)] for i in (0, 1)])
     made = []
     causes: tuple[tuple[Cause, list[float], list[float]], ...] = (
