@@ -135,7 +135,7 @@ def test_a_finding_says_itself_in_json_without_what_is_not_finite() -> None:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "q.pth"
-    torch.save(nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 2)).state_dict(), path)
+    torch.save(nn.Sequential(nn.Linear(4, 32), nn.ReLU(), nn.Linear(32, 2)).state_dict(), path)
     return path
 
 
@@ -168,24 +168,38 @@ def test_the_command_exits_with_0_where_all_is_well(
     (tmp_path / "ones.py").write_text(
         "import gymnasium, numpy, torch\n"
         "class World(gymnasium.Env):\n"
-        "    observation_space = gymnasium.spaces.Box(0, 1, (1,))\n"
+        "    observation_space = gymnasium.spaces.Box(0, 1, (2,))\n"
         "    action_space = gymnasium.spaces.Discrete(2)\n"
         "    def reset(self, *, seed=None, options=None):\n"
         "        super().reset(seed=seed)\n"
         "        self.t = 0\n"
-        "        return numpy.zeros(1, numpy.float32), {}\n"
+        "        return numpy.zeros(2, numpy.float32), {}\n"
         "    def step(self, action):\n"
         "        paid = float(action == self.t % 2)\n"
         "        self.t += 1\n"
-        "        return numpy.full(1, self.t % 2, numpy.float32), paid, self.t == 9, False, {}\n"
+        "        return numpy.array([self.t % 2, self.t / 9], numpy.float32), paid, self.t == 9, False, {}\n"
         "class Net(torch.nn.Module):\n"
         "    def __init__(self):\n"
         "        super().__init__()\n"
         "        self.scale = torch.nn.Parameter(torch.ones(1))\n"
         "    def forward(self, x):\n"
-        "        return self.scale * torch.cat([1 - x, x], dim=1)\n"
+        "        return self.scale * torch.cat([1 - x[:, :1], x[:, :1]], dim=1)\n"
     )
     monkeypatch.chdir(tmp_path)
     torch.save({"scale": torch.ones(1)}, "ones.pth")
     status = main(["doctor", "ones.pth", "--net", "ones:Net", "--env", "ones:World", "--gamma", "0"])
     assert status == 0 and "Healthy" in capsys.readouterr().out
+
+
+def test_a_run_that_misses_its_target_ends_with_three_findings_and_one_that_asks_with_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", "CartPole-v1", "--preset", "false", "--total-steps", "64", "--rollout.num-envs", "2"]
+    command += ["--rollout.num-steps", "16", "--evaluation-episodes", "1", "--resume-probe", "false"]
+    command += ["--stop-at-return", "475"]
+    assert main([*command, "--run-dir", str(tmp_path / "short")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("neuralq: doctor: [") == 3 and f"neuralq doctor {tmp_path / 'short'}" in said
+    assert "the target of 475 was not reached" in said
+    assert main(["train", "CartPole-v1", "--seeds", "2", "--doctor"]) == 2
+    assert "--doctor examines one run" in capsys.readouterr().err

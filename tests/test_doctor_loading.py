@@ -385,3 +385,16 @@ def test_policies_without_action_values_and_unknown_files_are_refused(tmp_path: 
         load_subject(written(tmp_path / "notes.txt", b"x"))
     with pytest.raises(CannotLoad, match="there is no"):
         load_subject(tmp_path / "nothing.zip")
+
+
+@pytest.mark.slow
+def test_a_run_is_examined_in_the_wrappers_it_was_trained_in(tmp_path: Path) -> None:
+    import neuralq
+    from neuralq.doctor import examine
+
+    run = neuralq.train(
+        "CartPole-v1", tmp_path / "run", total_steps=200, evaluation_episodes=1, resume_probe=False, preset=False,
+        num_envs=2, num_steps=16, hidden=(8,), frame_stack=2,
+    )  # fmt: skip
+    report = examine(run.run_dir, budget_s=2)
+    assert "V1" in {one.id for one in report.measured} and report.env == "CartPole-v1"

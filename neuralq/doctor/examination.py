@@ -12,6 +12,7 @@ import torch
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
 from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
+from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
 from neuralq.doctor.play import Clock, EnvironmentRaised, returns_from
@@ -24,7 +25,7 @@ from neuralq.types import Array
 
 __all__ = ["LEVELS", "NUM_PARTS", "examine"]
 
-LEVELS = ("exam",)
+LEVELS = ("exam", "experiments")
 
 _GAMMA = 0.99
 """Where neither the caller nor the file says."""
@@ -72,7 +73,8 @@ def examine(
     data: Any = None,
     settings: Mapping[str, Any] | None = None,
     net: str | None = None,
-    level: Literal["exam"] = "exam",
+    level: Literal["exam", "experiments"] = "exam",
+    seeds: int = 3,
     budget_s: float = 60.0,
     seed: int = 0,
     progress: Callable[[int, str], None] | None = None,
@@ -90,7 +92,8 @@ def examine(
         settings: of the training, where the file does not say: fields of `Settings`, such as
             ``{"target_period_updates": 500, "updates": 50_000}``.
         net: "module:Class" of a network that a state dict belongs to.
-        level: ``"exam"`` measures.
+        level: ``"exam"`` measures; ``"experiments"`` also trains, changing one thing at a time.
+        seeds: runs of each kind that experiments compare.
         budget_s: seconds for all of it.
         seed: of every draw.
         progress: told how many of `NUM_PARTS` parts are through, and what comes next.
@@ -108,6 +111,7 @@ def examine(
     check_choice("level", level, LEVELS)
     check_positive("budget_s", budget_s)
     check_whole("seed", seed, 0)
+    check_whole("seeds", seeds, 2)
     clock = Clock(budget_s)
     loaded = load_subject(subject, net)
     given = env if env is not None else loaded.env
@@ -123,7 +127,9 @@ def examine(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches: threads would only wait for each other
     try:
-        return _examined(loaded, world, discount, known, columns, seed, clock, say)
+        return _examined(
+            loaded, world, discount, known, columns, seed, clock, say, seeds if level == "experiments" else 0
+        )
     finally:
         torch.set_num_threads(threads)
 
@@ -142,7 +148,7 @@ class _Teller:
 
 def _examined(
     subject: Subject, world: World, gamma: float, settings: Settings, columns: Mapping[str, Array] | None, seed: int,
-    clock: Clock, say: _Teller,
+    clock: Clock, say: _Teller, seeds: int,
 ) -> Report:  # fmt: skip
     try:
         case = begin(subject, world, gamma, settings, columns, seed, clock, say)
@@ -150,9 +156,14 @@ def _examined(
         return _broken(subject, world, gamma, clock, str(error))
     measured, missing = _measured(case, say)
     findings, headline = decide(measured)
-    return Report(
-        subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, _drawn(case)
-    )
+    drawn = _drawn(case)
+    if seeds:
+        tried = run_experiments(case, [one for one in findings if one.grade in "AB"], seeds, say)
+        measured, missing = [*measured, *tried.findings], {**missing, **tried.missing}
+        findings, headline = decide(measured)
+        if tried.factorial is not None:
+            drawn["factorial"] = tried.factorial
+    return Report(subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, drawn)
 
 
 def _measured(case: Case, say: _Teller) -> tuple[list[Finding], dict[str, str]]:

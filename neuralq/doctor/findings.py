@@ -6,10 +6,12 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-__all__ = ["CAUSES", "Cause", "Finding", "Grade"]
+__all__ = ["CAUSES", "UNEXPLAINED", "Cause", "Finding", "Grade"]
 
 Cause = Literal["environment", "algorithm", "representation", "data", "luck"]
 Grade = Literal["A", "B", "C"]
+UNEXPLAINED = {"V1", "V6a", "V7"}
+"""Findings that say that the policy is bad and nothing of why."""
 CAUSES: tuple[Cause, ...] = ("environment", "algorithm", "representation", "data", "luck")
 
 

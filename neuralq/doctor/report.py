@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neuralq.doctor.findings import CAUSES, Cause, Finding
+from neuralq.doctor.findings import CAUSES, UNEXPLAINED, Cause, Finding
 from neuralq.doctor.page import page_of
 from neuralq.types import Array
 
@@ -48,8 +48,9 @@ class Report:
 
     @property
     def cause(self) -> Cause | None:
-        """The first cause; None where nothing of grade A or B was found."""
-        return None if self.healthy else self.findings[0].cause
+        """The first cause; None where nothing of grade A or B was found, or where what was found has no cause yet."""
+        unexplained = {one.id for one in self.findings if one.grade in "AB"} <= UNEXPLAINED
+        return None if self.healthy or unexplained else self.findings[0].cause
 
     def explain(self) -> str:
         """The report in one screen of text."""

@@ -13,12 +13,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from neuralq.doctor.findings import Finding
+from neuralq.doctor.findings import UNEXPLAINED, Finding
 
 __all__ = ["decide"]
 
 _ORDER = (
-    *("NaN", "E1", "E3", "E6", "R6a", "D1", "D2", "D5", "E4", "E5", "D3", "D4", "V5", "V3", "R1", "V4", "V7a", "V2"),
+    *(
+        "X3",
+        "X2",
+        "X1",
+        "NaN",
+        "E1",
+        "E3",
+        "E6",
+        "R6a",
+        "D1",
+        "D2",
+        "D5",
+        "E4",
+        "E5",
+        "D3",
+        "D4",
+        "R1",
+        "V5",
+        "V3",
+        "V4",
+        "V7a",
+        "V2",
+    ),
     *("V6a", "V7", "V1", "R3", "R6", "E2", "V6", "V3a", "V8", "R2", "R4", "R5"),
 )
 _CERTAIN = {"E1", "E3", "E6", "D1", "D2", "D5", "V7", "V7a", "V6a"}
@@ -88,7 +110,7 @@ def _headline(flagged: Sequence[Finding], by_id: Mapping[str, Finding]) -> str:
             return "Nothing was found: the policy has learned; whether its values are right could not be measured."
         return "Cannot tell: too little could be measured; see what was not, and why."
     first = named[0]
-    if {one.id for one in named} <= {"V1", "V6a", "V7"}:
+    if {one.id for one in named} <= UNEXPLAINED:
         return (
             f"Cannot tell the cause from measurements alone: {first.title}, and nothing measured says why "
             f"({first.id}, grade {first.grade}). Experiments would: --level experiments."

@@ -17,6 +17,7 @@ from neuralq.mdp import FiniteMDP
 from neuralq.runs.recipe.games import make_single, refusals_name
 from neuralq.runs.recipe.handed import Handed, handed_over
 from neuralq.runs.recipe.stand_in import Maker, standing_in
+from neuralq.runs.recipe.wrapping import wrapped
 from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.types import Array
 
@@ -86,7 +87,7 @@ def open_world(env: Any) -> World:
 
     Args:
         env: a Gymnasium id, "module:id", an environment, a class or function that makes one, a `FiniteMDP`, or the
-            mapping ``{"env": …, "env_kwargs": …}`` of a run.
+            mapping of a run: ``env``, ``env_kwargs``, ``wrappers`` and ``frame_stack``.
 
     Raises:
         ValueError: it cannot be made, its actions are not `Discrete`, or its observations are composite.
@@ -96,12 +97,14 @@ def open_world(env: Any) -> World:
         >>> world.limit, world.liftable, world.num_actions, world.model is None
         (500, True, 2, True)
     """
-    handed = Handed(env["env"], dict(env.get("env_kwargs") or {})) if isinstance(env, Mapping) else handed_over(env)
+    named = isinstance(env, Mapping)
+    handed = Handed(env["env"], dict(env.get("env_kwargs") or {})) if named else handed_over(env)
+    around = (env.get("wrappers", ()), env.get("frame_stack", 1)) if named else ((), 1)
 
     def make() -> gym.Env[Any, Any]:
         with standing_in(handed.make), refusals_name(handed.env), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return make_single(handed.env, handed.env_kwargs)
+            return wrapped(make_single(handed.env, handed.env_kwargs), *around)
 
     first = make()
     try:

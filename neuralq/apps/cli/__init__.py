@@ -68,6 +68,7 @@ COMMANDS = {
     "record": _of("media", "record", "film a trained run as a GIF or MP4", _LOOK),
     "export": _of("export", "export", "write a run's network as ONNX, checked against its values", _LOOK),
     "doctor": _of("doctor", "doctor", "why a value function is bad, of a run or a file of another library", _LOOK),
+    "probe": _of("doctor", "probe", "try a training function of yours on eight environments of known values", _LOOK),
     "lab": _of("lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page", _KNOW),
     "baird": _of("demo", "baird", "predict divergence on Baird's star, then measure it", _KNOW),
     "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),

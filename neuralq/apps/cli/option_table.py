@@ -39,6 +39,7 @@ class TrainOptions:
         run_dir: folder for the run, or None for one of its own.
         tensorboard: whether to write event files.
         wandb: whether to log to Weights & Biases.
+        doctor: whether to examine the run at its end.
         hooks: hooks of the user's own as "module:name".
         seeds: how many seeds to run side by side, or None for one run.
         workers: how many of them at a time, or None for as many as there are cores.
@@ -50,6 +51,7 @@ class TrainOptions:
     run_dir: str | None
     tensorboard: bool
     wandb: bool
+    doctor: bool
     hooks: tuple[str, ...]
     seeds: int | None
     workers: int | None
@@ -135,6 +137,7 @@ _FLAGS = {
     "print_config": "print the resulting configuration and exit",
     "tensorboard": "write TensorBoard event files (extra tensorboard)",
     "wandb": "log to Weights & Biases (extra wandb)",
+    "doctor": "examine the run at its end, as neuralq doctor does, for a minute at most",
     "json": "print the result as one JSON object on the last line",
     "debug": DEBUG,
 }

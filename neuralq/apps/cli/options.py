@@ -25,7 +25,7 @@ from neuralq.runs.recipe.replay_presets import AGENTS
 __all__ = ["parse_train"]
 
 _MOST_SEEDS = 10_000
-_WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "print_config"}
+_WITHOUT_VALUE = {"h", "help", "json", "debug", "tensorboard", "wandb", "doctor", "print_config"}
 
 
 def _with_env_named(argv: Sequence[str]) -> list[str]:
@@ -120,6 +120,7 @@ def parse_train(argv: Sequence[str]) -> tuple[RunConfig, TrainOptions] | None:
         run_dir=given.pop("run_dir", None),
         tensorboard=given.pop("tensorboard", False),
         wandb=given.pop("wandb", False),
+        doctor=given.pop("doctor", False),
         hooks=tuple(given.pop("hook", ())),
         seeds=given.pop("seeds", None),
         workers=given.pop("workers", None),
@@ -160,6 +161,8 @@ def _check_counts(options: TrainOptions) -> None:
             raise Failure(f"--{name} must be a whole number of at least 1, got {number}", 2)
         if number is not None and number > _MOST_SEEDS:
             raise Failure(f"--{name} must be at most {_MOST_SEEDS:,}, got a number of {number.bit_length()} bits", 2)
+    if options.doctor and options.seeds is not None:
+        raise Failure("--doctor examines one run; leave it out, and examine a seed: neuralq doctor SWEEP/seed-0", 2)
     if options.workers is not None and options.seeds is None:
         raise Failure("--workers says how many seeds run at a time; add --seeds or leave it out", 2)
 

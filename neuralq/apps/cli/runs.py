@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.doctor import examined
 from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, resume_kind, say, train_kind
 from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
@@ -54,6 +55,9 @@ def train(argv: list[str]) -> int:
         say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
         with _hooks(path, config, options.tensorboard, options.wandb, options.hooks) as hooks:
             run = CONTROL.train(config, path, hooks)
+    if options.doctor or (run.reached is False and run.stopped_by is None):
+        for line in examined(run.run_dir, whole=options.doctor):
+            say(line)
     return _conclude(run, options.json, config.stop_at_return, config.engine != "auto")
 
 

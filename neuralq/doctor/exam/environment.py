@@ -126,8 +126,8 @@ def disguised_limit(case: Case) -> Finding:
 
 def _limit_finding(share: float, auc: float, longest: int, said: str) -> Finding:
     return Finding(
-        "E3", "a time limit is reported as termination", "environment", "B", auc, None, 0.7,
-        "Pardo et al. 2018; share of ends at one step ≥ 0.9 and AUC < 0.7 are our own", share >= 0.9 and auc < 0.7,
+        "E3", "a time limit is reported as termination", "environment", "B", auc, None, 0.85,
+        "Pardo et al. 2018; share of ends at one step ≥ 0.9 and AUC < 0.85 are our own", share >= 0.9 and auc < 0.85,
         said,
         "return truncated=True at the limit, or leave it to gymnasium.make(..., max_episode_steps=N)",
         f"env.reset(); print([env.step(env.action_space.sample())[2:4] for _ in range({max(longest, 1)})][-1])",
@@ -138,7 +138,7 @@ def _told_apart(case: Case, episodes: Sequence[Episode], length: int) -> float:
     rng = case.rng(3)
     rows, labels, names = [], [], []
     for i, one in enumerate(episodes):
-        earlier = rng.integers(length // 2, length - 1, size=4)
+        earlier = length - 1 - rng.permutation(min(5, length - 2))[:4]  # near it: states drift over a long episode
         rows += [one.observations[-1], *one.observations[earlier]]
         labels += [1.0, *[0.0] * len(earlier)]
         names += [i] * (1 + len(earlier))

@@ -300,6 +300,8 @@ def untouched(case: Case) -> Finding:
     distance to that; where it is no larger than in fresh networks, nothing has been learned yet.
     """
     network = _network(case)
+    if sum(p.numel() for p in network.parameters()) < 100:
+        raise CannotMeasure("the network has fewer than 100 weights, too few to tell how they are distributed")
     own = _distance(network)
     rng = case.rng(31)
     most = max(_distance(fresh(network, rng)) for _ in range(_NUM_FRESH))

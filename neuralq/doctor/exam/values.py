@@ -155,12 +155,14 @@ def reach(case: Case) -> Finding:
 
 
 def _faster_copies(case: Case) -> str:
-    origin = case.subject.origin
-    if "Stable-Baselines3" in origin or "sb3-contrib" in origin:
-        steps = case.settings.env_steps or 50_000
-        interval = max(int(steps / (4 * case.horizon)), 1) if case.gamma < 1 else 10
-        return f"DQN('MlpPolicy', env, target_update_interval={interval}, ...)  # and train as long again"
-    return f"neuralq train {case.world.name} --learner replay --target-period-updates 50"
+    """Targets that look further ahead, so that copies need not come so often that the updates chase themselves."""
+    ours = f"neuralq train {case.world.name}  # λ-returns, which carry rewards further at once"
+    if case.subject.origin.startswith(("DQN of Stable-Baselines3", "QR-DQN")):
+        interval = max(int(3 * (case.settings.env_steps or 50_000) / min(case.horizon, 10**6)), 1)
+        return (
+            f"DQN('MlpPolicy', env, n_steps=5, target_update_interval={interval}, ...)  # as many steps again\n{ours}"
+        )
+    return ours
 
 
 def rank(case: Case) -> Finding:

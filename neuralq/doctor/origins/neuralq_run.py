@@ -30,7 +30,10 @@ def _load(path: Path, net: str | None) -> Subject:
     if not isinstance(agent, Agent):
         raise CannotLoad(f"{path} is a run of {type(agent).__name__}, whose moves are no actions of an environment")
     config = config_from_dict(read_config(path))
-    env = {"env": config.env, "env_kwargs": dict(config.env_kwargs)}
+    env = {
+        "env": config.env, "env_kwargs": dict(config.env_kwargs), "wrappers": config.wrappers,
+        "frame_stack": config.frame_stack,
+    }  # fmt: skip
     return of_agent(agent, f"neuralq run {path}", _settings(config, path, agent.reward_scale), env)
 
 

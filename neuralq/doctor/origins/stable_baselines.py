@@ -157,7 +157,8 @@ def _settings(told: Mapping[str, Any], optimiser: bytes | None, what: str) -> Se
     starts = number("learning_starts") or 0.0
     period = None
     if steps and updates and interval:  # counted in environment steps
-        period = max(interval * updates / max(steps - starts, 1.0), 1e-9)
+        at_once = number("gradient_steps") or 1.0  # updates between which nothing is copied
+        period = max(interval * updates / max(steps - starts, 1.0), at_once, 1e-9)
     return Settings(
         gamma=number("gamma"), learning_rate=_last_rate(optimiser, what) or number("learning_rate"), tau=number("tau"),
         num_steps=number("n_steps") or 1.0, lambda_=0.0, target_period_updates=period, updates=updates, env_steps=steps,

@@ -1,0 +1,347 @@
+"""X1–X3: controlled experiments: one thing is changed at a time, with the same seeds and an interval.
+
+* X2, *fit*: can the subject's architecture represent the returns of the policy at hand? A fresh copy of it and a body
+  of ours (two layers of 256 with LayerNorm, observations normalised) are regressed on them, split by episode. Only the
+  gap counts, because noise caps what either can explain.
+* X3, *repair*: from the subject's settings, as far as they are known,
+the one thing is changed that a measurement named.
+  If the greedy return rises by more than chance, it is confirmed.
+* X1, *factorial*: {its algorithm, ours (λ-returns)} × {its body, ours}. What changes the algorithm gains over both
+  bodies speaks against the algorithm, what changes the body gains over both algorithms against the representation
+  (oracles swapped in one at a time: Fu et al. 2019).
+
+Learners are neuralq's own: what is tried is what was done,
+not somebody else's code. Steps are so many that all runs fit
+into the budget, and the same for every run that is compared.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.wrappers import TransformObservation, TransformReward
+from torch import Tensor, nn
+
+from neuralq.doctor.exam.case import CannotMeasure, Case
+from neuralq.doctor.exam.network import fresh
+from neuralq.doctor.findings import Cause, Finding
+from neuralq.doctor.play import returns_from
+from neuralq.runs import train
+from neuralq.runs.recipe.stand_in import Maker
+from neuralq.runs.sweep.statistics import interquartile_mean
+from neuralq.types import Array, Floats
+
+__all__ = ["Experiments", "fit", "run_experiments"]
+
+_FEWEST_STEPS, _MOST_STEPS = 2_000, 50_000
+_OUR_HIDDEN = (256, 256)
+_GAP = 0.10
+
+
+@dataclass
+class Experiments:
+    """What experiments found.
+
+    Args:
+        findings: of grade A.
+        missing: what could not be tried, and why.
+        factorial: mean greedy returns ``[2, 2]``: bodies (theirs, ours) by algorithms (theirs, ours).
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+    missing: dict[str, str] = field(default_factory=dict)
+    factorial: Floats | None = None
+
+
+def run_experiments(case: Case, named: Sequence[Finding], seeds: int, say: Callable[[str], None]) -> Experiments:
+    """X2, then the repair of what is named first, then the factorial, as far as the budget goes."""
+    found = Experiments()
+    say("experiment X2: can the network represent the returns?")
+    _try(found, "X2", lambda: fit(case, seeds))
+    baseline: list[float] = []
+    plan = _Plan(case, seeds)
+    repair = next((r for one in named if (r := _repair(case, one)) is not None), None)
+    if repair is None:
+        found.missing["X3"] = "no finding names one thing that could be changed in a learner of ours"
+    else:
+        say(f"experiment X3: {repair.title}")
+        _try(found, "X3", lambda: _repaired(plan, repair, baseline))
+    say("experiment X1: their algorithm and body, and ours")
+    _try(found, "X1", lambda: _factorial(plan, found))
+    return found
+
+
+def _try(found: Experiments, name: str, experiment: Callable[[], Finding | Sequence[Finding]]) -> None:
+    try:
+        made = experiment()
+        found.findings += [made] if isinstance(made, Finding) else made
+    except CannotMeasure as reason:
+        found.missing[name] = str(reason)
+    except (RuntimeError, ValueError) as error:
+        found.missing[name] = f"it failed: {type(error).__name__}: {str(error)[:200]}"
+
+
+# X2
+
+
+def fit(case: Case, seeds: int = 3) -> Finding:
+    """X2: R² on held-out episodes of G regressed by the subject's architecture and by ours; the gap, over seeds."""
+    network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
+    if network is None or encode is None or outputs is None:
+        raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
+    s, a, g, names = _labelled(case)
+    x = case.world.as_rows(s)
+    if x.shape[1] > 2000:
+        raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
+    ours = torch.as_tensor((x - x.mean(0)) / np.where(x.std(0) > 1e-12, x.std(0), 1.0)).float()
+    theirs = encode(s)
+    gaps, scores = [], []
+    for seed in range(max(seeds, 3)):
+        rng = case.rng(70 + seed)
+        held = np.isin(names, rng.permutation(np.unique(names))[: max(len(np.unique(names)) // 3, 1)])
+        own = _regressed(fresh(network, rng), lambda net: outputs(net, theirs), a, g, held, rng)
+        better = _regressed(
+            _our_body(ours.shape[1], case.world.num_actions, rng), lambda net: net(ours), a, g, held, rng
+        )
+        gaps.append(better - own)
+        scores.append((own, better))
+    low, high = _t_interval(gaps)
+    own, better = np.mean(scores, axis=0)
+    return Finding(
+        "X2", "the network cannot represent the returns", "representation", "A", float(np.mean(gaps)), (low, high),
+        _GAP,
+        "own", bool(low > _GAP),
+        f"a fresh network of this architecture explains {100 * own:.0f} % of the variance of held-out returns, one "
+        f"of ours "
+        f"{100 * better:.0f} %",
+        "a wider body with LayerNorm, and observations scaled to about ±1",
+        f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
+    )  # fmt: skip
+
+
+def _labelled(case: Case) -> tuple[Array, Array, Floats, Array]:
+    """s, a and G of steps whose return is known, and of which episode they are; at most 4,000."""
+    rows = []
+    for i, one in enumerate((*case.greedy, *case.explored)):
+        g = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        if len(g):
+            rows.append((one.observations[: len(g)], one.actions[: len(g)], g, np.full(len(g), i)))
+    if len(rows) < 9:
+        raise CannotMeasure("fewer than 9 episodes have steps whose return is known")
+    s, a, g, names = (np.concatenate([row[k] for row in rows]) for k in range(4))
+    if g.std() < 1e-9:
+        raise CannotMeasure("all returns are the same, so that there is nothing to represent")
+    pick = case.rng(69).permutation(len(g))[:4000]
+    return s[pick], a[pick], g[pick], names[pick]
+
+
+def _our_body(width: int, num_actions: int, rng: np.random.Generator) -> nn.Module:
+    layers: list[nn.Module] = []
+    for below, above in zip((width, *_OUR_HIDDEN), _OUR_HIDDEN, strict=False):
+        layers += [nn.Linear(below, above), nn.LayerNorm(above), nn.ReLU()]
+    return fresh(nn.Sequential(*layers, nn.Linear(_OUR_HIDDEN[-1], num_actions)), rng)
+
+
+def _regressed(
+    net: nn.Module, values: Callable[[nn.Module], Tensor], a: Array, g: Floats, held: Array, rng: np.random.Generator
+) -> float:
+    """R² on the held-out rows after 400 Adam steps on the others."""
+    target = torch.as_tensor((g - g[~held].mean()) / max(float(g[~held].std()), 1e-12)).float()
+    chosen, learn = torch.as_tensor(a)[:, None], torch.as_tensor(np.flatnonzero(~held))
+    optimiser = torch.optim.Adam(net.parameters(), lr=1e-3)
+    for _ in range(400):
+        error = ((values(net).gather(1, chosen)[:, 0] - target)[learn] ** 2).mean()
+        optimiser.zero_grad()
+        torch.autograd.backward(error)
+        nn.utils.clip_grad_norm_(net.parameters(), 10.0)
+        optimiser.step()
+    with torch.no_grad():
+        left = (values(net).gather(1, chosen)[:, 0] - target)[torch.as_tensor(held)].double()
+    variance = float(target[torch.as_tensor(held)].double().var(correction=0))
+    return max(1.0 - float((left**2).mean()) / max(variance, 1e-12), -1.0)
+
+
+def _t_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Of the mean, by Student's t over seeds."""
+    from scipy.stats import t
+
+    n = len(values)
+    half = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / np.sqrt(n)
+    return float(np.mean(values) - half), float(np.mean(values) + half)
+
+
+# X3 and X1
+
+
+@dataclass(frozen=True)
+class _Repair:
+    """One change: of settings, or of the environment."""
+
+    title: str
+    cause: Cause
+    named: Finding
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    make: Maker | None = None
+
+
+def _repair(case: Case, one: Finding) -> _Repair | None:
+    """The change that a finding asks for; None where none can be made in a learner of ours."""
+    known, make = case.settings, case.world.make
+    rate = known.learning_rate or 5e-4
+    changes: dict[str, tuple[str, dict[str, Any], Maker | None]] = {
+        "R1": (f"step size {rate / 10:.2g} in place of {rate:.2g}", {"learning_rate": rate / 10}, None),
+        "R6a": ("step size 5e-4", {"learning_rate": 5e-4}, None),
+        "V4": ("the target network copied every 500 updates", {"target_period_updates": 500}, None),
+        "V5": ("a target of 10 steps, copied every 200 updates", {"target_period_updates": 200, "num_steps": 10}, None),
+        "V2": ("double Q-learning", {"target_rule": "double"}, None),
+        "D3": ("a buffer of 50,000 steps", {"capacity": 50_000}, None),
+        "D4": ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None),
+        "E4": ("observations normalised", {}, lambda: _normalised(case, make())),
+        "E5": ("rewards of at most 1", {}, lambda: TransformReward(make(), lambda r: float(r) / case.largest_reward)),
+    }
+    if one.id not in changes:
+        return None
+    title, settings, made = changes[one.id]
+    return _Repair(title, one.cause, one, settings, made)
+
+
+def _normalised(case: Case, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    x = case.world.as_rows(np.concatenate([one.observations for one in case.chance]))
+    mean, spread = x.mean(0), np.where(x.std(0) > 1e-12, x.std(0), 1.0)
+    shape = env.observation_space.shape or ()
+    space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    return TransformObservation(
+        env,
+        lambda s: ((np.asarray(s, np.float64).reshape(-1) - mean) / spread).reshape(shape).astype(np.float32),
+        space,
+    )
+
+
+class _Plan:
+    """Runs of neuralq's learners: how they are set, and how many steps the budget allows each."""
+
+    def __init__(self, case: Case, seeds: int) -> None:
+        self.case, self.seeds = case, seeds
+        self._rate: float | None = None
+
+    def theirs(self) -> dict[str, Any]:
+        """The subject's settings as far as they are known; where not, those of neuralq's replay."""
+        known = self.case.settings
+        asked = {
+            "learning_rate": known.learning_rate, "batch_size": known.batch_size, "capacity": known.capacity,
+            "target_period_updates": known.target_period_updates, "num_steps": known.num_steps,
+        }  # fmt: skip
+        whole = {"batch_size", "capacity", "target_period_updates", "num_steps"}
+        given = {k: max(int(v), 1) if k in whole else v for k, v in asked.items() if v is not None}
+        if known.updates and known.env_steps:
+            given["train_period"] = max(round(known.env_steps / known.updates), 1)
+        if "capacity" in given:
+            given["learning_starts"] = min(1000, given["capacity"])
+            given["batch_size"] = min(given.get("batch_size", 64), given["capacity"])
+        explores = {"epsilon_start": known.epsilon_start, "epsilon_end": known.epsilon_end}
+        return {"learner": "replay", **given, **{k: v for k, v in explores.items() if v is not None}}
+
+    def their_body(self) -> dict[str, Any]:
+        """The widths of the subject's dense layers; neuralq's default where they are not known."""
+        network = self.case.subject.network
+        linear = [] if network is None else [m for m in network.modules() if isinstance(m, nn.Linear)]
+        return {"hidden": tuple(m.out_features for m in linear[:-1])} if len(linear) > 1 else {}
+
+    def steps_for(self, runs: int) -> int:
+        """Steps of each of so many runs in what is left of the budget.
+
+        Raises:
+            CannotMeasure: they would be too few to learn anything.
+        """
+        if self._rate is None:
+            began = time.monotonic()
+            self.run({**self.theirs(), **self.their_body()}, 0, 1000, None)
+            self._rate = 1000 / (time.monotonic() - began)
+        steps = int(0.7 * self.case.clock.left / runs * self._rate)
+        if steps < _FEWEST_STEPS:
+            raise CannotMeasure(
+                f"the budget allows {steps:,} steps for each of {runs} runs, and {_FEWEST_STEPS:,} are the least; give "
+                "more with --budget"
+            )
+        return min(steps, int(self.case.settings.env_steps or _MOST_STEPS), _MOST_STEPS)
+
+    def run(self, settings: Mapping[str, Any], seed: int, steps: int, make: Maker | None) -> float:
+        """The greedy return that one run ends with."""
+        with tempfile.TemporaryDirectory() as folder:
+            made = train(
+                make or self.case.world.make, Path(folder) / "run", preset=False, seed=seed, total_steps=steps,
+                gamma=self.case.gamma, evaluate_every=steps, evaluation_episodes=10, evaluation_max_steps=1000,
+                checkpoint_every=10 * steps, resume_probe=False, epsilon_decay_steps=max(steps // 5, 1), **settings,
+            )  # fmt: skip
+        return float(made.greedy_return if made.greedy_return is not None else np.nan)
+
+
+def _repaired(plan: _Plan, repair: _Repair, baseline: list[float]) -> Finding:
+    steps = plan.steps_for(2 * plan.seeds)
+    before = {**plan.theirs(), **plan.their_body()}
+    baseline += [plan.run(before, seed, steps, None) for seed in range(plan.seeds)]
+    after = [plan.run({**before, **repair.settings}, seed, steps, repair.make) for seed in range(plan.seeds)]
+    if repair.make is not None and repair.named.id == "E5":
+        after = [one * plan.case.largest_reward for one in after]
+    gain, (low, high) = float(np.mean(after) - np.mean(baseline)), _difference(after, baseline)
+    return Finding(
+        "X3", f"confirmed: {repair.named.title}" if low > 0 else "the repair changed nothing for sure", repair.cause,
+        "A",
+        gain, (low, high), 0.0, "the interval of the gain lies above 0", low > 0,
+        f"with {repair.title} {plan.seeds} runs of {steps:,} steps return {np.mean(after):.4g}, without it "
+        f"{np.mean(baseline):.4g}", repair.named.remedy, repair.named.confirm,
+    )  # fmt: skip
+
+
+def _difference(more: Sequence[float], less: Sequence[float]) -> tuple[float, float]:
+    """95 % interval of the difference of two interquartile means, the seeds of each drawn by themselves.
+
+    Of three against three it lies above 0 where hardly any run without the change did as well as one with it, which by
+    chance happens about once in twenty times.
+    """
+    rng = np.random.default_rng(0)
+    drawn = [
+        interquartile_mean(np.asarray(v, np.float64)[rng.integers(len(v), size=(10_000, len(v)))]) for v in (more, less)
+    ]
+    low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5])
+    return float(low), float(high)
+
+
+def _factorial(plan: _Plan, found: Experiments) -> list[Finding]:
+    steps = plan.steps_for(4 * plan.seeds)
+    case = plan.case
+    ours = {"learner": "rollout", "normalise_observations": False}
+    wide = {"hidden": _OUR_HIDDEN, "layer_norm": True}
+    normalised: Maker | None = None if case.world.is_discrete else lambda: _normalised(case, case.world.make())
+    cells: dict[tuple[int, int], list[float]] = {}
+    for i, (body, make) in enumerate(((plan.their_body(), None), (wide, normalised))):
+        for j, algorithm in enumerate((plan.theirs(), ours)):
+            cells[i, j] = [plan.run({**algorithm, **body}, 100 + seed, steps, make) for seed in range(plan.seeds)]
+    found.factorial = np.array([[np.mean(cells[i, j]) for j in (0, 1)] for i in (0, 1)])
+    made = []
+    causes: tuple[tuple[Cause, list[float], list[float]], ...] = (
+        ("algorithm", [*cells[0, 1], *cells[1, 1]], [*cells[0, 0], *cells[1, 0]]),
+        ("representation", [*cells[1, 0], *cells[1, 1]], [*cells[0, 0], *cells[0, 1]]),
+    )
+    for cause, more, less in causes:
+        low, high = _difference(more, less)
+        what = "the learner of λ-returns" if cause == "algorithm" else "a body of two normalised layers of 256"
+        made.append(
+            Finding(
+                "X1", f"another {cause} does better", cause, "A", float(np.mean(more) - np.mean(less)), (low, high),
+                0.0,
+                "the interval of the main effect lies above 0", low > 0,
+                f"{what} returns {np.mean(more):.4g} over both others, what the subject has {np.mean(less):.4g} "
+                f"({steps:,} steps, {plan.seeds} seeds)",
+                f"take {what}", f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
+            )
+        )  # fmt: skip
+    return made

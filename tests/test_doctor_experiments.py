@@ -1,0 +1,136 @@
+"""The doctor's experiments: what they name is what was changed, and where nothing is wrong nothing is named."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from torch import nn
+
+from neuralq.doctor import Settings, examine
+from neuralq.doctor.exam.case import CannotMeasure, Case, begin
+from neuralq.doctor.exam.network import fresh
+from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, _t_interval, fit
+from neuralq.doctor.findings import Finding
+from neuralq.doctor.play import Clock
+from neuralq.doctor.subject import of_network
+from neuralq.doctor.worlds import open_world
+from neuralq.types import Array
+
+
+class Wavy(gym.Env[Any, Any]):
+    """Episodes of one step that pay sin(3x) of a uniform x: linear in nothing, and easy for a wide body."""
+
+    observation_space = spaces.Box(-1, 1, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-1, 1, 1).astype(np.float32)
+        return self.x, {}
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        return self.x, math.sin(6 * float(self.x[0])), True, False, {}
+
+
+def case_of(net: nn.Module, settings: Settings | None = None, budget_s: float = 60.0) -> Case:
+    subject = of_network(net, "x", settings=settings)
+    return begin(subject, open_world(Wavy), 0.9, subject.settings, None, 0, Clock(budget_s), lambda text: None)
+
+
+@pytest.mark.slow
+def test_a_body_that_is_too_small_is_told_from_one_that_is_not() -> None:
+    rng = np.random.default_rng(0)
+    one = fresh(nn.Sequential(nn.Linear(1, 1), nn.Tanh(), nn.Linear(1, 2)), rng)
+    wide = fresh(
+        nn.Sequential(
+            nn.Linear(1, 256), nn.LayerNorm(256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 2)
+        ),
+        rng,
+    )
+    small, large = (fit(case_of(net), 3) for net in (one, wide))
+    assert small.flagged and small.value > 0.1 and small.cause == "representation" and small.grade == "A"
+    assert not large.flagged and abs(large.value) < 0.1
+
+
+def test_intervals_are_students_and_those_of_every_resample() -> None:
+    from scipy.stats import ttest_1samp
+
+    a, b = [1.0, 2.0, 4.0], [0.0, 0.5, 0.2]
+    assert _t_interval(a) == pytest.approx(tuple(ttest_1samp(a, 0).confidence_interval()))
+    means = [np.array([np.mean(one) for one in product(v, repeat=3)]) for v in (a, b)]  # 27 each; of 3 none is cut off
+    every = np.subtract.outer(*means)
+    assert _difference(a, b) == pytest.approx(np.percentile(every, [2.5, 97.5]), abs=0.1)
+    assert _difference(a, b)[0] > 0 > _difference(a, [0.0, 3.0, 0.2])[0]
+
+
+def named(name: str) -> Finding:
+    return Finding(name, name, "algorithm", "B", 1.0, flagged=True, remedy="r", confirm="c")
+
+
+def test_a_repair_is_confirmed_by_what_runs_return_and_by_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The runs are stood in for: what is held here is which settings are compared and what is concluded."""
+    asked: list[tuple[dict[str, Any], int]] = []
+
+    def run(self: _Plan, settings: Any, seed: int, steps: int, make: Any) -> float:
+        asked.append((dict(settings), seed))
+        return seed + (10.0 if settings.get("learning_rate") == 0.005 else 0.0)
+
+    monkeypatch.setattr(_Plan, "run", run)
+    known = Settings(learning_rate=0.05, capacity=500, updates=1000, env_steps=4000, target_period_updates=20)
+    case = case_of(nn.Sequential(nn.Linear(1, 7), nn.ReLU(), nn.Linear(7, 2)), known)
+    plan, baseline = _Plan(case, 3), list[float]()
+    helps = _repaired(plan, _Repair("lr", "algorithm", named("R1"), {"learning_rate": 0.005}), baseline)
+    assert helps.flagged and helps.value == 10 and helps.grade == "A" and helps.interval is not None
+    idle = _repaired(plan, _Repair("x", "algorithm", named("R1"), {"num_steps": 2}), [])
+    assert not idle.flagged and idle.value == 0
+    before, _ = next(one for one in asked if one[0]["learning_rate"] == 0.05)
+    assert before == {
+        "learner": "replay", "learning_rate": 0.05, "capacity": 500, "learning_starts": 500, "batch_size": 64,
+        "target_period_updates": 20, "train_period": 4, "hidden": (7,),
+    }  # fmt: skip
+    assert [seed for settings, seed in asked if settings["learning_rate"] == 0.005] == [0, 1, 2]
+
+
+def test_a_budget_that_is_too_small_for_runs_is_said() -> None:
+    plan = _Plan(case_of(nn.Linear(1, 2), budget_s=0.01), 3)
+    plan._rate = 1000.0
+    with pytest.raises(CannotMeasure, match="more with --budget"):
+        plan.steps_for(6)
+
+
+class Beat(gym.Env[Any, Any]):
+    """Pays where the action is the one that the observation shows, 20 times."""
+
+    observation_space = spaces.Box(-1, 1, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._draw(), {}
+
+    def _draw(self) -> Array:
+        self.x = float(self.np_random.choice([-1.0, 1.0]))
+        return np.array([self.x], np.float32)
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        paid = float((self.x > 0) == bool(action))
+        self.t += 1
+        return self._draw(), paid, self.t == 20, False, {}
+
+
+@pytest.mark.slow
+def test_experiments_confirm_a_step_size_that_is_far_too_small() -> None:
+    """With 1e-7 nothing is learned in 3,000 steps, with 5e-4 all of it."""
+    net = fresh(nn.Sequential(nn.Linear(1, 64), nn.ReLU(), nn.Linear(64, 2)), np.random.default_rng(0))
+    known = {"learning_rate": 1e-7, "updates": 3000, "env_steps": 3000, "target_period_updates": 100}
+    report = examine(net, Beat, gamma=0.5, settings=known, level="experiments", budget_s=150)
+    first = report.findings[0]
+    assert (first.id, first.grade, report.cause) == ("X3", "A", "algorithm") and first.value > 5
+    assert report.drawn["factorial"].shape == (2, 2) and report.drawn["factorial"][0, 1] > 15
