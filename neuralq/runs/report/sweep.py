@@ -6,6 +6,7 @@ import os
 from html import escape
 from pathlib import Path
 
+from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.report.comparison import Group, comparison_svg, read_groups
 from neuralq.runs.report.page import Page, format_number, tiles
 
@@ -21,7 +22,7 @@ def write_sweep_report(sweep_dir: str | Path) -> Path:
     """
     folder = Path(sweep_dir)
     groups, left_out = read_groups([folder])
-    env = str(groups[0].settings.get("env") or folder.resolve().name)
+    env = str(read_config(groups[0].runs[0].path).get("env") or folder.resolve().name)
     count = sum(len(group.runs) for group in groups)
     page = Page(f"{env}: {count} seeds", lead="Each seed is a run of its own; none was chosen.")
     for group in groups:
@@ -42,7 +43,9 @@ def write_sweep_report(sweep_dir: str | Path) -> Path:
 def _tiles(group: Group) -> list[tuple[str, str, str]]:
     found, steps = group.estimate, max(run.env_steps for run in group.runs)
     seconds = sum(run.cpu_seconds for run in group.runs)
-    interval = f"95 % interval {_short(found.low)} to {_short(found.high)}" if len(group.runs) > 1 else "one seed"
+    interval = "one seed"
+    if found.low is not None and found.high is not None:
+        interval = f"95 % interval {_short(found.low)} to {_short(found.high)}"
     spread = f"{_short(min(group.returns))} to {_short(max(group.returns))}"
     return [
         ("final return", _short(found.iqm), f"interquartile mean over {len(group.runs)} seeds, {interval}"),
