@@ -212,7 +212,7 @@ def report(argv: list[str]) -> int:
     )
     parser.add_argument("run", help="folder of a run or of a sweep")
     options = parser.parse_args(argv)
-    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else write_report(options.run)
+    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else write_report(single_run(options.run))
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
 
