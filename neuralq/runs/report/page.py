@@ -183,8 +183,8 @@ def format_number(value: float, digits: int = 4) -> str:
     """A number for reading: whole ones with thousands separators, others with ``digits`` significant ones.
 
     Example:
-        >>> format_number(20480.0), format_number(1.0023925, 8), format_number(1e300), format_number(float("nan"))
-        ('20,480', '1.0023925', '1e+300', 'not a number')
+        >>> format_number(20480.0), format_number(1.0023925, 8), format_number(-18465369.7), format_number(float("nan"))
+        ('20,480', '1.0023925', '-1.847e7', 'not a number')
     """
     if math.isnan(value):
         return "not a number"
@@ -192,7 +192,9 @@ def format_number(value: float, digits: int = 4) -> str:
         return "infinite" if value > 0 else "minus infinite"
     if value == int(value) and abs(value) < 1e15:
         return f"{int(value):,}"
-    return f"{value:,.1f}" if 1e4 <= abs(value) < 1e9 else f"{value:.{digits}g}"
+    if 1e4 <= abs(value) < 1e6:
+        return f"{value:,.1f}"
+    return f"{value:.{digits}g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
 
 
 def format_value(value: Any) -> str:
