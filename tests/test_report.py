@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from neuralq.apps.cli import main
 from neuralq.apps.pages import star
 from neuralq.apps.pages.star import divergence_svg, growth_table, values_table, write_demo_report
 from neuralq.checks import MissingExtra
@@ -32,7 +33,8 @@ from neuralq.runs.report import (
     signals_svg,
     write_report,
 )
-from neuralq.runs.report.readings import finite_series, first_not_finite, quartiles, thin
+from neuralq.runs.report.grid import grid_svg
+from neuralq.runs.report.readings import finite_series, first_not_finite, quartiles, standard_errors, thin
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
@@ -153,6 +155,75 @@ def test_a_run_becomes_one_page_with_its_facts(tmp_path: Path) -> None:
         assert words in outline.text
     assert "The target of 2.5 was first reached at 128." in outline.text
     assert not list(run.glob("*.partial")) and not list(run.glob(".*.partial"))
+
+
+EXACT = {
+    "q_error_max": 0.5, "q_error_mean": 0.25, "q_error_max_all": 2.0, "q_error_mean_all": 1.0, "regret": 3.0,
+    "optimal_share": 0.75, "optimal_share_all": 0.5, "start_value": 4.0, "exact_start_value": 5.0,
+}  # fmt: skip
+GRID = {
+    "num_columns": 2, "signs": ["", "H", "", "G"], "arrows": [2, None, 1, None], "optimal": [True, None, False, None],
+    "learned": [1.0, None, 2.5, None], "exact": [1.5, None, 2.5, None], "visited": [True, False, False, False],
+}  # fmt: skip
+
+
+def test_the_page_begins_with_what_a_person_wants(tmp_path: Path) -> None:
+    run = make_run(tmp_path, [train_row(64), evaluation_row(64, [9.0]), evaluation_row(128, [0.0, 1.0, 1.0, 0.0])])
+    off = {"agent": "best", "final_return": 0.5, "best_return": 9.0, "num_episodes": 100, "standard_error": 0.125}
+    monitor = {"alarms": [{"kind": "soft divergence"}], "seen": "It grew.", "advice": ["a target network"]}
+    (run / "summary.json").write_text(
+        json.dumps({"exact": EXACT, "play_off": off, "monitor": monitor, "env_steps": 128})
+    )
+    (run / "exact.json").write_text(json.dumps(GRID))
+    text = check_page(page := write_report(run).read_text()).text
+    error = math.sqrt(1 / 3) / 2  # of two zeros and two ones
+    for words in (
+        f"0.5 ± {error:.2g}", "4 episodes at 128 steps", "at 64 steps", "exactly 5", "soft divergence",
+        "the last parameters score 0.5 and the best 9, with a standard error of 0.12 of the difference: the best are",
+        "worth 4 by what was learned, and 5 exactly. The greedy policy earns 3 less",
+        "It grew. What may help: a target",
+    ):  # fmt: skip
+        assert words in text, words
+    rows = re.findall(r"<th scope=\"row\">([^<]*)</th><td>([^<]*)</td><td>([^<]*)</td>", page)
+    assert ("mean |Q − Q*|", "0.25", "1") in rows and ("states with an optimal action", "75%", "50%") in rows
+    assert 'id="grid"' in page and "errors up to 0.5." in text and "data:" not in page
+    assert page.index("0.5 ±") < page.index("Learning curve") < page.index("Everything that was recorded")
+
+
+def test_a_band_of_zeros_and_ones_is_their_standard_error(tmp_path: Path) -> None:
+    chances, scores = [evaluation_row(64, [0.0, 1.0, 1.0])], [evaluation_row(64, [0.0, 1.0, 2.0])]
+    steps, low, high = standard_errors(chances)
+    assert steps.tolist() == [64.0] and (high - low)[0] == pytest.approx(2 * math.sqrt(1 / 3) / math.sqrt(3))
+    assert "standard error wide" in check_page(write_report(make_run(tmp_path / "a", chances)).read_text()).text
+    assert "middle half" in check_page(write_report(make_run(tmp_path / "b", scores)).read_text()).text
+
+
+@pytest.mark.parametrize("change", [{"num_columns": 3}, {"num_columns": 0}, {"signs": 1}, {"learned": [1.0]}])
+def test_a_map_that_is_none_is_left_out(change: dict[str, Any]) -> None:
+    assert grid_svg(GRID) is not None and grid_svg({**GRID, **change}) is None
+
+
+@pytest.mark.parametrize("value", [None, "text", [1], {}, math.nan, 1e400, True], ids=lambda value: str(value)[:6])
+def test_a_summary_of_unpleasant_values_is_shown_as_far_as_it_goes(value: Any, tmp_path: Path) -> None:
+    run = make_run(tmp_path, ROWS)
+    exact, off = dict.fromkeys(EXACT, value), dict.fromkeys(("agent", "final_return", "best_return"), value)
+    monitor = {"alarms": value, "seen": value, "advice": value}
+    summary = {"exact": exact, "play_off": off, "monitor": monitor, "env_steps": value, "stopped_by": value}
+    (run / "summary.json").write_text(json.dumps(summary))
+    (run / "exact.json").write_text(json.dumps({**GRID, "learned": [value] * 4, "arrows": [value] * 4}))
+    check_page(write_report(run).read_text())
+
+
+def test_a_sweep_has_a_page_whose_seeds_lead_to_theirs(tmp_path: Path) -> None:
+    words = "--seeds 2 --total-steps 64 --evaluation-episodes 2 --rollout.num-envs 2 --rollout.num-steps 16"
+    assert main(["train", "CartPole-v1", *words.split(), "--run-dir", str(tmp_path / "s")]) == 0
+    assert main(["report", str(tmp_path / "s" / "seed-1")]) == 0
+    assert main(["report", str(tmp_path / "s")]) == 0
+    page = (tmp_path / "s" / "report.html").read_text()
+    outline = Outline(page)
+    assert "CartPole-v1: 2 seeds" in outline.text and page.count("<svg") == 1
+    assert outline.outside == [("href", f"seed-{n}/report.html") for n in (0, 1)]
+    assert '<a href="seed-1/report.html">seed 1</a>' in page
 
 
 def test_the_same_run_gives_the_same_bytes_whatever_the_users_matplotlib_settings(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import neuralq
 from neuralq.apps.cli import main
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.environments import make_envs
+from neuralq.runs.recipe.wrapping import wrapped
 from neuralq.runs.stream import Interaction
 
 ENV = """
@@ -122,6 +123,8 @@ def test_wrappers_go_around_in_their_order(folder: Path) -> None:
     assert Interaction(envs, 0.9, 0).spec.shape == (3, 2)
     frames = make_envs(RunConfig(env="CartPole-v1", frame_stack=4), 2)
     assert frames.single_observation_space.shape == (4, 4)
+    pole = gym.make("CartPole-v1")
+    assert wrapped(pole, (), 1) is pole  # one frame is no stack
     with pytest.raises(ValueError, match=r"cannot import the wrapper 'slow_env:None_such'"):
         make_envs(RunConfig(env="CartPole-v1", wrappers=("slow_env:None_such",)), 1)
     with pytest.raises(ValueError, match="a wrapper is named 'module:Wrapper'"):

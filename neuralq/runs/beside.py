@@ -85,7 +85,8 @@ class Comparison:
         Example:
             >>> print(*Comparison(0.02, 0.01, 0.5, 0.1, 0.0, 1.0, 0.875, 0.54, 0.542).lines(), sep="; ")
             value of the start 0.540, exactly 0.542; the greedy policy earns 0 less than an optimal one; \
-optimal actions in 100% of the visited states, 88% of all; |Q − Q*| at most 0.02 (mean 0.01) where it has been, 0.5 (mean 0.1) everywhere
+optimal actions in 100% of the visited states, 88% of all; |Q − Q*| at most 0.02 (mean 0.01) \
+where it has been, 0.5 (mean 0.1) everywhere
         """
         lost = "never ends" if math.isinf(self.regret) else f"earns {self.regret:.3g} less than an optimal one"
         seen = "" if self.optimal_share is None else f"{self.optimal_share:.0%} of the visited states, "

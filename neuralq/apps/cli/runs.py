@@ -31,7 +31,7 @@ from neuralq.runs.kinds import KINDS, kind_in
 from neuralq.runs.loop import Hook
 from neuralq.runs.offline.files import read_recorded
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
-from neuralq.runs.report import write_report
+from neuralq.runs.report import write_report, write_sweep_report
 from neuralq.runs.sweep import is_sweep_folder, open_sweep
 
 __all__ = ["evaluate", "report", "resume", "train"]
@@ -204,10 +204,15 @@ def _estimate(path: Path, options: argparse.Namespace) -> int:
 
 def report(argv: list[str]) -> int:
     """Write a run's report."""
-    parser = command_parser("report", "Write a run's report.html (extra plot).", "neuralq report RUN")
-    parser.add_argument("run", help="run folder")
+    parser = command_parser(
+        "report",
+        "Write report.html into the folder of a run or of a sweep (extra plot).",
+        "neuralq report runs/cart",
+        "neuralq report runs/cart-10-seeds",
+    )
+    parser.add_argument("run", help="folder of a run or of a sweep")
     options = parser.parse_args(argv)
-    path = write_report(single_run(options.run))
+    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else write_report(single_run(options.run))
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
 

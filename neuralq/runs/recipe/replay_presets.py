@@ -51,13 +51,7 @@ REPLAY_PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         (env, "replay"): {"total_steps": 100_000, "evaluate_every": 5_000, "replay": _MULTISTEP}
         for env in ("Acrobot-v1", "LunarLander-v3")
     },
-    # With five rewards values fall to those of never arriving before the goal is met once; with one they fall slowly,
-    # which was enough on one of three seeds (docs/benchmarks.md); the rollout learner's preset does better.
-    ("MountainCar-v0", "replay"): {
-        "total_steps": 120_000,
-        "evaluate_every": 6_000,
-        "replay": {**_MULTISTEP, "num_steps": 1, "learning_rate": 2e-3},
-    },
+    ("MountainCar-v0", "replay"): {"total_steps": 120_000, "evaluate_every": 6_000, "replay": _MULTISTEP},
     # DQN of Young & Tian (2019, examples/dqn.py of the games' repository), but Adam for centred RMSProp with momentum,
     # and the network with PQN's layer normalisation.
     **{

@@ -10,6 +10,7 @@ from neuralq.runs.folder.files import read_rows
 from neuralq.runs.report.curves import learning_curve_svg, signals_svg
 from neuralq.runs.report.page import Page
 from neuralq.runs.report.run import write_report
+from neuralq.runs.report.sweep import write_sweep_report
 
 __all__ = [
     "MissingExtra",
@@ -18,4 +19,5 @@ __all__ = [
     "read_rows",
     "signals_svg",
     "write_report",
+    "write_sweep_report",
 ]

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from neuralq.figures import COLOURS, draw_svg, scale_axis, steps_axis, tame
-from neuralq.runs.report.readings import Row, finite_series, quartiles, thin
+from neuralq.runs.report.readings import Row, as_float, finite_series, quartiles, standard_errors, thin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["SIGNALS", "learning_curve_svg", "signals_svg"]
+__all__ = ["SIGNALS", "curve_words", "learning_curve_svg", "signals_svg"]
 
 SIGNALS = {"abs_td_error": "mean |δ|", "max_q": "largest Q", "loss": "loss"}
 """Columns of a training row drawn by `signals_svg`, with their axis labels."""
@@ -30,7 +31,9 @@ def learning_curve_svg(rows: Sequence[Row], target: float | None = None, *, name
     """
     train_steps, train_returns = finite_series(rows, "train", "episode_return")
     greedy_steps, greedy_returns = finite_series(rows, "evaluation", "greedy_return")
-    band_steps, low, high = quartiles(rows)
+    of_chances = _all_or_nothing(rows)
+    band_steps, low, high = standard_errors(rows) if of_chances else quartiles(rows)
+    band = "± standard error" if of_chances else "its middle half of episodes"
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -40,7 +43,7 @@ def learning_curve_svg(rows: Sequence[Row], target: float | None = None, *, name
         if len(greedy_steps):
             if len(band_steps):
                 axes.fill_between(band_steps, tame(low), tame(high), color=COLOURS[0], alpha=0.18, linewidth=0,
-                                  label="its middle half of episodes")  # fmt: skip
+                                  label=band)  # fmt: skip
             every = max(1, len(greedy_steps) // 40)
             axes.plot(greedy_steps, tame(greedy_returns), color=COLOURS[0], marker="o", markevery=every,
                       label="greedy policy (mean)")  # fmt: skip
@@ -54,6 +57,26 @@ def learning_curve_svg(rows: Sequence[Row], target: float | None = None, *, name
         figure.legend(handles, labels, loc="outside upper left", ncols=2)
 
     return draw_svg(name, "Learning curve", _describe_curve(rows, target), (5.2, 3.8), paint)
+
+
+def _all_or_nothing(rows: Sequence[Row]) -> bool:
+    """Whether every greedy episode scores one of two returns: then the middle half of them is the whole range."""
+    listed = [
+        row["returns"] for row in rows if row.get("kind") == "evaluation" and isinstance(row.get("returns"), list)
+    ]
+    seen = {as_float(value) for returns in listed for value in returns}
+    return 0 < len(seen) <= 2 and all(map(math.isfinite, seen))
+
+
+def curve_words(rows: Sequence[Row]) -> str:
+    """What the learning curve shows."""
+    band = (
+        "is one standard error wide on each side" if _all_or_nothing(rows) else "holds the middle half of its episodes"
+    )
+    return (
+        f"The line of dots is the policy without exploration; the band {band}. Training episodes still explore, so "
+        "they may score lower."
+    )
 
 
 def _describe_curve(rows: Sequence[Row], target: float | None) -> str:

@@ -14,31 +14,49 @@ import numpy as np
 
 from neuralq.runs.folder.files import write_durably
 
-__all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table"]
+__all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table", "tiles"]
 
 _STYLE = """
-:root { color-scheme: light; }
+:root {
+  color-scheme: light dark;
+  --page: #ffffff; --card: #f6f7f9; --ink: #1b1f24; --soft: #525a63; --line: #dfe3e8;
+  --warn: #d55e00; --warn-back: #fdf3ec;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --page: #14171a; --card: #1d2126; --ink: #e8ebee; --soft: #a9b2bb; --line: #3d454d;
+    --warn: #ff8a4c; --warn-back: #3a2013;
+  }
+  svg.figure { filter: invert(1) hue-rotate(180deg); } /* ink and grid of the figures, which have no ground */
+}
 * { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: #1b1b1b; font: 1rem/1.55 system-ui, sans-serif; }
+body { margin: 0; background: var(--page); color: var(--ink); font: 1rem/1.55 system-ui, sans-serif; }
 main, header, footer { max-width: 46rem; margin: 0 auto; padding: 0 1rem; }
 header { padding-top: 1.5rem; }
 h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 .25rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .5rem; }
 p { margin: .6rem 0; max-width: 40rem; overflow-wrap: anywhere; }
-.lead { color: #444; }
-.warning { border-left: .3rem solid #d55e00; padding: .4rem .8rem; background: #fdf3ec; }
+.lead { color: var(--soft); }
+.warning { border-left: .3rem solid var(--warn); padding: .4rem .8rem; background: var(--warn-back); }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: .6rem; margin: 1rem 0; }
+.tiles div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .5rem .8rem; }
+.tiles dt { color: var(--soft); font-size: .9rem; }
+.tiles dd { margin: 0; overflow-wrap: anywhere; }
+.tiles dd:nth-of-type(1) { font-size: 1.35rem; font-weight: 600; font-variant-numeric: tabular-nums; }
+.tiles dd:nth-of-type(2) { color: var(--soft); font-size: .85rem; }
 figure { margin: 1rem 0; }
-figcaption { color: #444; font-size: .92rem; }
+figcaption { color: var(--soft); font-size: .92rem; }
 svg.figure { display: block; width: 100%; height: auto; }
 .scroll { overflow-x: auto; margin: .3rem 0 .8rem; }
 table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
-.caption { color: #444; font-size: .92rem; margin-bottom: 0; }
-th, td { text-align: left; vertical-align: top; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid #e3e3e3; }
+.caption { color: var(--soft); font-size: .92rem; margin-bottom: 0; }
+th, td { text-align: left; vertical-align: top; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); }
 th { font-weight: 600; }
 .facts td { overflow-wrap: anywhere; }
 .facts th { min-width: 8rem; }
+a { color: inherit; }
 summary { cursor: pointer; font-weight: 600; margin: 1.4rem 0 .4rem; }
-footer { color: #555; font-size: .85rem; padding-top: 1.5rem; padding-bottom: 2rem; }
+footer { color: var(--soft); font-size: .85rem; padding-top: 1.5rem; padding-bottom: 2rem; }
 @media print { details > * { display: block; } .scroll { overflow: visible; } }
 """
 
@@ -125,6 +143,15 @@ def html_table(caption: str, header: Sequence[str], body: Sequence[Sequence[str]
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">\n<table>\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>\n</div>"
     )
+
+
+def tiles(entries: Sequence[tuple[str, str, str]]) -> str:
+    """Names, values and remarks as tiles side by side."""
+    body = "\n".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd><dd>{escape(remark)}</dd></div>"
+        for name, value, remark in entries
+    )
+    return f'<dl class="tiles">\n{body}\n</dl>'
 
 
 def facts_table(facts: Mapping[str, Any]) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from neuralq.types import Floats
 
-__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "thin"]
+__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "standard_errors", "thin"]
 
 Row = Mapping[str, Any]
 
@@ -59,12 +59,32 @@ def first_not_finite(rows: Iterable[Row], kind: str, name: str) -> int | None:
 
 def quartiles(rows: Iterable[Row]) -> tuple[Floats, Floats, Floats]:
     """Steps, first and third quartile of the returns of each greedy evaluation."""
+    return _bands(rows, lambda returns: (np.percentile(returns, 25), np.percentile(returns, 75)))
+
+
+def standard_errors(rows: Iterable[Row]) -> tuple[Floats, Floats, Floats]:
+    """Steps, and the mean of the returns of each greedy evaluation less and plus its standard error.
+
+    Example:
+        >>> rows = [{"kind": "evaluation", "env_steps": 8, "returns": [0.0, 0.0, 1.0, 1.0]}]
+        >>> [round(float(edge[0]), 3) for edge in standard_errors(rows)]
+        [8.0, 0.211, 0.789]
+    """
+
+    def around(returns: Floats) -> tuple[float, float]:
+        error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else 0.0
+        return returns.mean() - error, returns.mean() + error
+
+    return _bands(rows, around)
+
+
+def _bands(rows: Iterable[Row], edges: Callable[[Floats], tuple[float, float]]) -> tuple[Floats, Floats, Floats]:
     kept = []
     for steps, row in rows_by_step(rows, "evaluation"):
         listed = row.get("returns")
         returns = np.array([as_float(value) for value in listed] if isinstance(listed, list | tuple) else [])
         if returns.size and np.isfinite(returns).all():
-            kept.append((steps, *np.percentile(np.clip(returns, -1e300, 1e300), [25, 75])))
+            kept.append((steps, *edges(np.clip(returns, -1e150, 1e150))))
     table = np.array(kept, np.float64).reshape(-1, 3)
     return table[:, 0], table[:, 1], table[:, 2]
 

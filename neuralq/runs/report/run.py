@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuralq.runs.beside import DRAWING_NAME
+from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.files import read_json, read_rows
 from neuralq.runs.folder.run_folder import warn_of_lost_rows
-from neuralq.runs.report.curves import SIGNALS, learning_curve_svg, signals_svg
-from neuralq.runs.report.page import Page, facts_table, flatten
+from neuralq.runs.report.curves import SIGNALS, curve_words, learning_curve_svg, signals_svg
+from neuralq.runs.report.grid import grid_svg
+from neuralq.runs.report.outcome import exact_table, network_table, play_off_words, tiles_of, watched_words
+from neuralq.runs.report.page import Page, facts_table, flatten, tiles
 from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite
 
 __all__ = ["write_report"]
@@ -46,8 +51,45 @@ def write_report(run_dir: str | Path) -> Path:
     warn_of_lost_rows(folder, len(rows), summary.pop("num_rows", None))
     target = _first_number(config, _TARGET_KEYS)
     page = Page(_title(config, folder), lead=_lead(rows, target))
-    page.heading("Result")
-    page.table(facts_table(_facts(rows, summary)))
+    _outcome(page, folder, rows, summary, target)
+    page.heading("Learning curve")
+    page.figure(learning_curve_svg(rows, target), curve_words(rows))
+    _soundness(page, rows, summary)
+    page.heading("How it was made")
+    if (network := network_table(_layers(folder))) is not None:
+        page.folded(f"What was learned: {network[0]}", network[1])
+    page.folded("Everything that was recorded", facts_table(_facts(rows, summary)))
+    page.folded("Effective configuration", _recorded(config))
+    page.folded("Versions", _recorded(versions))
+    return page.write(folder / "report.html")
+
+
+def _outcome(page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str, Any], target: float | None) -> None:
+    """How well it plays, and the exact answer beside it."""
+    if found := tiles_of(rows, summary, target):
+        page.table(tiles(found))
+    if (decided := play_off_words(summary)) is not None:
+        page.paragraph(decided)
+    if (beside := exact_table(summary)) is None:
+        return
+    page.heading("Beside the exact answer")
+    page.paragraph(beside[0])
+    page.table(beside[1])
+    path = folder / DRAWING_NAME
+    drawn = grid_svg(read_json(path)) if path.exists() else None
+    if drawn is not None:
+        page.figure(
+            drawn,
+            "Arrows are greedy actions, those of states that were never visited pale; a frame marks one that is not "
+            "optimal. On the right, or below, how far the value of each state is from the exact one.",
+        )
+
+
+def _soundness(page: Page, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
+    """Whether learning diverged: the monitor's word, and the signals."""
+    page.heading("Is learning sound?")
+    if (watched := watched_words(summary)) is not None:
+        page.paragraph(watched[0], warning=watched[1])
     for column, label in SIGNALS.items():
         step = first_not_finite(rows, "train", column)
         if step is not None:
@@ -56,26 +98,25 @@ def write_report(run_dir: str | Path) -> Path:
                 "The signals below show how it grew before.",
                 warning=True,
             )
-    page.heading("Learning curve")
-    page.figure(
-        learning_curve_svg(rows, target),
-        "The line of dots is the policy without exploration; the band holds the middle half of its episodes. Training "
-        "episodes still explore, so they may score lower.",
-    )
-    page.heading("Is learning sound?")
     signals = signals_svg(rows)
     if signals is None:
         page.paragraph("No TD error, Q value or loss was recorded yet.")
-    else:
-        page.figure(
-            signals,
-            "δ is the TD error: how far a prediction is from its target. A largest Q that climbs past every return "
-            "that can be had, with |δ| climbing along, is divergence.",
-        )
-    page.heading("How it was made")
-    page.folded("Effective configuration", _recorded(config))
-    page.folded("Versions", _recorded(versions))
-    return page.write(folder / "report.html")
+        return
+    page.figure(
+        signals,
+        "δ is the TD error: how far a prediction is from its target. A largest Q that climbs past every return "
+        "that can be had, with |δ| climbing along, is divergence.",
+    )
+
+
+def _layers(folder: Path) -> Any:
+    """Name, offset and shape of every tensor, as the newest checkpoint has them; None where there is none to read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a damaged one is named by whoever needs it
+            return checkpoint.load_newest(folder / "checkpoints").state.get("layers")
+    except (checkpoint.CheckpointError, OSError):
+        return None
 
 
 def _recorded(facts: Mapping[str, Any]) -> str:

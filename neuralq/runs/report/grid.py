@@ -1,0 +1,99 @@
+"""The map of a grid world: what was learned, and how far it is from the exact answer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuralq.figures import draw_svg
+from neuralq.runs.report.readings import as_float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["grid_svg"]
+
+_ARROWS = "↑→↓←"
+_MOST_CELLS = 400
+_COLUMNS = ("signs", "arrows", "optimal", "learned", "exact", "visited")
+
+
+def grid_svg(drawing: Mapping[str, Any], *, name: str = "grid") -> str | None:
+    """Two maps: values with the greedy action of each cell, and |V − V*|; None where there is nothing to draw.
+
+    Args:
+        drawing: columns of one entry per cell, row by row from the top left: "signs", "arrows" (0 to 3, clockwise from
+            up), "optimal" (whether that action is), "learned" and "exact" values, "visited"; and "num_columns".
+        name: prefix of the ids in the SVG.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    width = drawing.get("num_columns")
+    columns = [drawing.get(key) for key in _COLUMNS]
+    if not isinstance(width, int) or width < 1 or not all(isinstance(column, list) for column in columns):
+        return None
+    signs, arrows, optimal, learned, exact, visited = columns
+    count = len(signs)  # type: ignore[arg-type]
+    if not 0 < count <= _MOST_CELLS or count % width or any(len(column) != count for column in columns):  # type: ignore[arg-type]
+        return None
+    v, right = (np.array([as_float(x) for x in column]).reshape(-1, width) for column in (learned, exact))  # type: ignore[union-attr]
+    height = len(v)
+    error = np.abs(v - right)
+
+    def paint(figure: Figure) -> None:
+        panels = figure.subplots(1, 2) if width <= 8 else figure.subplots(2, 1)
+        _paint_map(panels[0], v, "value and greedy action", "cividis", below=0.34)
+        _paint_map(panels[1], error, "|V − V*|", "Oranges", below=0.0)
+        cells = zip(signs, arrows, optimal, visited, v.ravel(), strict=True)  # type: ignore[arg-type]
+        for i, (sign, arrow, right_way, seen, value) in enumerate(cells):
+            y, x = divmod(i, width)
+            if isinstance(arrow, int) and 0 <= arrow < 4 and math.isfinite(value):
+                ink = {"color": _ink(value, v), "alpha": 1.0 if seen else 0.5}
+                panels[0].text(x, y - 0.12, _ARROWS[arrow], ha="center", va="center", fontsize=14, **ink)
+                if not right_way:
+                    panels[0].plot(x, y - 0.12, marker="s", ms=15, mfc="none", mec="#d55e00", mew=2)
+            elif isinstance(sign, str):
+                for axes in panels:
+                    axes.text(x, y, sign[:2], ha="center", va="center", color="#888888")
+
+    size = (6.0, 0.5 + 2.9 * height / width) if width <= 8 else (6.0, 0.9 + 2 * 5.8 * height / width)
+    worst = f"{np.nanmax(error):.3g}" if np.isfinite(error).any() else "unknown"
+    return draw_svg(name, "Map of the grid", f"Values and greedy actions, and errors up to {worst}.", size, paint)
+
+
+def _paint_map(axes: Axes, values: Any, title: str, shades: str, below: float) -> None:
+    """Cells in colour, as outlines and not as an image, which the page could not load; their numbers, so far below."""
+    shown = np.ma.masked_invalid(np.clip(values, -1e150, 1e150))
+    height, width = shown.shape
+    edges = np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5
+    most = float(shown.max()) * 1.5 if shades == "Oranges" and shown.count() and shown.max() > 0 else None
+    axes.pcolormesh(*edges, shown, cmap=shades, vmax=most, edgecolors="#888888", linewidth=0.4)
+    axes.set(title=title, xticks=[], yticks=[], ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.title.set_fontsize(11)
+    axes.grid(visible=False)
+    for edge in axes.spines.values():
+        edge.set_visible(False)
+    if width > 12:
+        return
+    for (y, x), value in np.ndenumerate(shown.filled(np.nan)):
+        if math.isfinite(value):
+            size = 8 if width <= 8 else 7
+            axes.text(
+                x,
+                y + below,
+                f"{value:.3g}",
+                ha="center",
+                va="center",
+                fontsize=size,
+                color="#111111" if shades == "Oranges" else _ink(value, shown.filled(np.nan)),
+            )
+
+
+def _ink(value: float, values: Any) -> str:
+    low, high = np.nanmin(values), np.nanmax(values)
+    return "#111111" if high > low and (value - low) / (high - low) > 0.55 else "#ffffff"

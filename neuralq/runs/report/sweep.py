@@ -1,0 +1,72 @@
+"""The page of a sweep: what its seeds come to together, each of them, and their curves."""
+
+from __future__ import annotations
+
+import os
+from html import escape
+from pathlib import Path
+
+from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.report.comparison import Group, comparison_svg, read_groups
+from neuralq.runs.report.page import Page, format_number, tiles
+
+__all__ = ["write_sweep_report"]
+
+
+def write_sweep_report(sweep_dir: str | Path) -> Path:
+    """Writes ``report.html`` into the folder of a sweep and returns its path; seeds that are not there yet are named.
+
+    Raises:
+        RunFolderError: no seed has been evaluated yet.
+        MissingExtra: matplotlib is not installed.
+    """
+    folder = Path(sweep_dir)
+    groups, left_out = read_groups([folder])
+    env = str(read_config(groups[0].runs[0].path).get("env") or folder.resolve().name)
+    count = sum(len(group.runs) for group in groups)
+    page = Page(f"{env}: {count} seeds", lead="Each seed is a run of its own; none was chosen.")
+    for group in groups:
+        page.table(tiles(_tiles(group)))
+    for line in left_out:
+        page.paragraph(line, warning=True)
+    page.heading("Learning curves")
+    page.figure(
+        comparison_svg(groups),
+        "Greedy return: interquartile mean over seeds, and its 95 % bootstrap interval where there are several.",
+    )
+    page.heading("Seeds")
+    for group in groups:
+        page.table(_seeds(group, folder))
+    return page.write(folder / "report.html")
+
+
+def _tiles(group: Group) -> list[tuple[str, str, str]]:
+    found, steps = group.estimate, max(run.env_steps for run in group.runs)
+    seconds = sum(run.cpu_seconds for run in group.runs)
+    interval = "one seed"
+    if found.low is not None and found.high is not None:
+        interval = f"95 % interval {_short(found.low)} to {_short(found.high)}"
+    spread = f"{_short(min(group.returns))} to {_short(max(group.returns))}"
+    return [
+        ("final return", _short(found.iqm), f"interquartile mean over {len(group.runs)} seeds, {interval}"),
+        ("lowest and highest seed", spread, "final greedy return"),
+        ("environment steps", f"{steps:,}", f"of the longest run; {_short(seconds)} CPU-seconds in all"),
+    ]
+
+
+def _seeds(group: Group, folder: Path) -> str:
+    """A table whose seeds lead to their own pages, where those have been written."""
+    body = ""
+    for run in sorted(group.runs, key=lambda one: one.seed):
+        page, name = run.path / "report.html", f"seed {run.seed}"
+        where = escape(os.path.relpath(page, folder), quote=True)
+        told = f'<a href="{where}">{name}</a>' if page.exists() else name
+        cells = (_short(run.returns[-1]), _short(run.returns.max()), f"{run.env_steps:,}", _short(run.cpu_seconds))
+        body += f'<tr><th scope="row">{told}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>\n"
+    heads = ("", "final return", "best evaluation", "environment steps", "CPU-seconds")
+    head = "".join(f'<th scope="col">{one}</th>' for one in heads)
+    return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>\n</table></div>'
+
+
+def _short(value: float) -> str:
+    return format_number(float(f"{value:.4g}"))
