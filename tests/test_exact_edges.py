@@ -23,6 +23,8 @@ from neuralq.exact import (
     solve_average,
     td_operator,
 )
+from neuralq.exact.problem import prepare
+from neuralq.exact.undiscounted import _most_steps
 from neuralq.mdp import FiniteMDP
 
 
@@ -157,3 +159,18 @@ def test_seconds_are_those_of_this_answer() -> None:
     resting = FiniteMDP.from_arrays([[[1.0]]], [[0.0]])
     found += [solve(resting, 1.0).seconds, solve_average(resting).seconds]
     assert all(0 < seconds < time.perf_counter() - began for seconds in found)
+
+
+def test_the_bound_on_the_number_of_steps_is_above_the_number() -> None:
+    # 0 → 1 → 2 → end, and 0 → end: three steps at most; rounding must not leave the bound below it.
+    mdp = FiniteMDP.from_functions(3, 2, lambda s: [0, 1], lambda s, a: [(1.0, min(s + 1, 2), -1.0, a == 1 or s == 2)])
+    assert 3 < _most_steps(prepare(mdp, 1.0), np.ones(mdp.num_rows, dtype=bool)) < 3 + 1e-6
+
+
+def test_a_cycle_is_named_whole_where_the_action_before_ends() -> None:
+    # In both states action 0 ends; action 1 leads to the other one and earns 1.
+    mdp = FiniteMDP.from_functions(2, 2, lambda s: [0, 1], lambda s, a: [(1.0, 1 - s, float(a), a == 0)])
+    with pytest.raises(
+        ValueError, match=r"cycle state (0 → state 1 → state 0|1 → state 0 → state 1) earns 2 each time"
+    ):
+        solve(mdp, 1.0, "bellman-ford")

@@ -12,6 +12,7 @@ import resource
 import sys
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from neuralq.lab.methods.td import TD
 from neuralq.lab.problems import problem as named
 from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.piecewise import follow
+from neuralq.lab.verdicts.update_maps import update_maps
 from neuralq.lab.verdicts.words import is_poor
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
@@ -380,3 +382,14 @@ def test_the_bound_along_a_chain_is_that_of_the_chain_and_not_of_the_expected_up
     assert expected is not None and along is not None and abs(along - expected) > 1e-3 * expected
     radii = [diagnose(problem, step_size=x * along, sampling="markov").spectral_radius for x in (0.999, 1.001)]
     assert radii[0] < 1 < radii[1]
+
+
+def test_a_half_life_is_told_where_it_is_more_than_one_sweep() -> None:
+    for step_size, told in ((0.4, True), (0.5, False), (0.6, False)):  # factors .6, .5 and .4
+        assert ("it halves every" in diagnose(one_weight(gamma=0.0), step_size=step_size).explain()) == told
+
+
+@pytest.mark.parametrize("lacks", [{"learner": None}, {"expected": None}, {"remembers": lambda options: True}])
+def test_each_reason_alone_leaves_a_method_without_maps(lacks: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="no memoryless sampled update"):
+        update_maps(linear_process(one_weight()), replace(TD, **lacks), TD.checked({}), 0.1)
