@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from given_spaces import GivenSpace
 from gymnasium import spaces
 
 from neuralq.apps.cli import main
@@ -179,29 +180,6 @@ def test_what_cannot_be_exported_is_one_error(tmp_path: Path, monkeypatch: pytes
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "sweep"]
 
 
-class Strange(gym.Env[Any, Any]):
-    """Observations of a space that is given, with a mask or without one; actions are numbered from −1."""
-
-    action_space = spaces.Discrete(3, start=-1)
-
-    def __init__(self, which: str, masked: bool = False) -> None:
-        self.observation_space, self.masked = SPACES[which], masked
-
-    def look(self) -> tuple[Any, dict[str, Any]]:
-        mask = self.np_random.integers(0, 2, 3, np.int8)
-        mask[1] = 1
-        return self.observation_space.sample(), {"action_mask": mask} if self.masked else {}
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        return self.look()
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        observation, info = self.look()
-        return observation, float(action), bool(self.np_random.random() < 0.2), False, info
-
-
 SPACES: dict[str, gym.Space[Any]] = {
     "start": spaces.Discrete(4, start=-2),
     "late": spaces.Discrete(4, start=7),
@@ -216,7 +194,13 @@ SPACES: dict[str, gym.Space[Any]] = {
         arm=spaces.Tuple([spaces.MultiDiscrete([2, 3]), spaces.Box(0, 255, (2, 2), np.uint8)]),
     ),
 }  # fmt: skip
-gym.register("test/Strange-v0", Strange)
+
+
+def strange(which: str, masked: bool = False) -> GivenSpace:
+    return GivenSpace(SPACES[which], masked)
+
+
+gym.register("test/Strange-v0", strange)
 
 
 def untrained(which: str, masked: bool, layout: str, normalised: bool) -> tuple[RunConfig, Agent]:

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from given_spaces import GivenSpace
 from gymnasium import spaces
 from safetensors import safe_open
 from safetensors.torch import load_file
@@ -36,30 +37,6 @@ from neuralq.runs.recipe.environments import make_envs
 from neuralq.runs.stream import Interaction, Normalisation
 from neuralq.runs.stream.encoding import encoder_for
 
-
-class Odd(gym.Env[Any, Any]):
-    """Observations of a space that is given, with a mask or without one; actions are numbered from −1."""
-
-    action_space = spaces.Discrete(3, start=-1)
-
-    def __init__(self, which: str, masked: bool = False) -> None:
-        self.observation_space, self.masked = SPACES[which], masked
-
-    def look(self) -> tuple[Any, dict[str, Any]]:
-        mask = self.np_random.integers(0, 2, 3, np.int8)
-        mask[1] = 1
-        return self.observation_space.sample(), {"action_mask": mask} if self.masked else {}
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        return self.look()
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        observation, info = self.look()
-        return observation, float(action), bool(self.np_random.random() < 0.2), False, info
-
-
 SPACES: dict[str, gym.Space[Any]] = {
     "vector": spaces.Box(-1, 1, (4,)),
     "scaled": spaces.Box(np.array([-500.0, 0.0]), np.array([100.0, 1000.0]), dtype=np.float64),
@@ -70,7 +47,13 @@ SPACES: dict[str, gym.Space[Any]] = {
     "flags": spaces.Box(0, 1, (6, 6), np.bool_),
     "dict": spaces.Dict(speed=spaces.Box(-100, 100, (2,)), gear=spaces.Discrete(3, start=1)),
 }
-gym.register("test/Odd-v0", Odd)
+
+
+def odd(which: str, masked: bool = False) -> GivenSpace:
+    return GivenSpace(SPACES[which], masked)
+
+
+gym.register("test/Odd-v0", odd)
 NORMED = {"body": MLP((7, 5), layer_norm=True, activation="tanh")}
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "plain": ("vector", {"body": MLP((8, 8))}),

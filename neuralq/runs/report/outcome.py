@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from neuralq.runs.report.page import format_number, html_table
+from neuralq.runs.report.page import html_table, short_number
 from neuralq.runs.report.readings import Row, as_float, finite_series, rows_by_step
 
 __all__ = ["exact_table", "network_table", "play_off_words", "tiles_of", "watched_words"]
@@ -31,7 +31,7 @@ def tiles_of(rows: Sequence[Row], summary: Mapping[str, Any], target: float | No
     exact = summary.get("exact")
     if isinstance(exact, Mapping) and math.isfinite(start := as_float(exact.get("start_value"))):
         right = as_float(exact.get("exact_start_value"))
-        found.append(("value of the start", _number(start), f"exactly {_number(right)}"))
+        found.append(("value of the start", short_number(start), f"exactly {short_number(right)}"))
     monitor = summary.get("monitor")
     if isinstance(monitor, Mapping):
         alarms = [str(one.get("kind")) for one in _mappings(monitor.get("alarms"))]
@@ -47,14 +47,14 @@ def _returns(rows: Sequence[Row]) -> list[Tile]:
     listed = row.get("returns")
     each = np.array([as_float(one) for one in listed] if isinstance(listed, list) else [])
     last = as_float(row.get("greedy_return"))
-    value, remark = _number(last), f"greedy policy, at {at:,.0f} steps"
+    value, remark = short_number(last), f"greedy policy, at {at:,.0f} steps"
     if len(each) > 1 and np.isfinite(each).all() and np.abs(each).max() < 1e150:
-        value += f" ± {_number(float(each.std(ddof=1)) / math.sqrt(len(each)), 2)}"
+        value += f" ± {short_number(float(each.std(ddof=1)) / math.sqrt(len(each)), 2)}"
         remark = f"greedy policy, {len(each)} episodes at {at:,.0f} steps, standard error"
     best = int(returns.argmax())
     return [
         ("return per episode", value, remark),
-        ("best evaluation", _number(returns[best]), f"at {steps[best]:,.0f} steps"),
+        ("best evaluation", short_number(returns[best]), f"at {steps[best]:,.0f} steps"),
     ]
 
 
@@ -66,7 +66,9 @@ def _budget(rows: Sequence[Row], summary: Mapping[str, Any], target: float | Non
             values[name] = float(recorded[-1])
     if not math.isfinite(values["env_steps"]):
         return []
-    remark = f"{_number(values['cpu_seconds'])} CPU-seconds of training" if math.isfinite(values["cpu_seconds"]) else ""
+    remark = (
+        f"{short_number(values['cpu_seconds'])} CPU-seconds of training" if math.isfinite(values["cpu_seconds"]) else ""
+    )
     for name, words in (("stopped_by", "stopped by"), ("interrupted_by", "interrupted by")):
         if isinstance(summary.get(name), str):
             remark = f"{words} {summary[name]}"
@@ -75,7 +77,7 @@ def _budget(rows: Sequence[Row], summary: Mapping[str, Any], target: float | Non
     if target is not None:
         reached = steps[returns >= target]
         found.append(
-            ("target", _number(target), f"first reached at {reached[0]:,.0f}" if len(reached) else "not reached")
+            ("target", short_number(target), f"first reached at {reached[0]:,.0f}" if len(reached) else "not reached")
         )
     return found
 
@@ -95,8 +97,9 @@ def play_off_words(summary: Mapping[str, Any]) -> str | None:
     )
     return (
         f"The run ended below its best evaluation. Over {numbers['num_episodes']:,.0f} fresh episodes the last "
-        f"parameters score {_number(numbers['final_return'])} and the best {_number(numbers['best_return'])}, with a "
-        f"standard error of {_number(numbers['standard_error'], 2)} of the difference: {which} the run's agent."
+        f"parameters score {short_number(numbers['final_return'])} and the best "
+        f"{short_number(numbers['best_return'])}, with a standard error of "
+        f"{short_number(numbers['standard_error'], 2)} of the difference: {which} the run's agent."
     )
 
 
@@ -113,17 +116,19 @@ def exact_table(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     if not isinstance(found, Mapping):
         return None
     regret = as_float(found.get("regret"))
-    lost = "never ends" if regret == math.inf else f"earns {_number(regret)} less than an optimal one from the start"
+    lost = (
+        "never ends" if regret == math.inf else f"earns {short_number(regret)} less than an optimal one from the start"
+    )
     text = (
-        f"The start is worth {_number(as_float(found.get('start_value')))} by what was learned, and "
-        f"{_number(as_float(found.get('exact_start_value')))} exactly. The greedy policy {lost}."
+        f"The start is worth {short_number(as_float(found.get('start_value')))} by what was learned, and "
+        f"{short_number(as_float(found.get('exact_start_value')))} exactly. The greedy policy {lost}."
     )
     body = [[name, *(_share(name, as_float(found.get(key))) for key in keys)] for name, *keys in _EXACT]
     return text, html_table("Learned beside exact", ("", "states it has visited", "all states"), body)
 
 
 def _share(name: str, value: float) -> str:
-    return f"{value:.0%}" if "states" in name and math.isfinite(value) else _number(value)
+    return f"{value:.0%}" if "states" in name and math.isfinite(value) else short_number(value)
 
 
 def watched_words(summary: Mapping[str, Any]) -> tuple[str, bool] | None:
@@ -149,11 +154,3 @@ def network_table(layers: Any) -> tuple[str, str] | None:
 
 def _mappings(value: Any) -> list[Mapping[str, Any]]:
     return [one for one in value if isinstance(one, Mapping)] if isinstance(value, list) else []
-
-
-def _number(value: float, digits: int = 4) -> str:
-    return (
-        "unknown"
-        if math.isnan(value)
-        else format_number(float(f"{value:.{digits}g}") if math.isfinite(value) else value)
-    )

@@ -14,7 +14,7 @@ import numpy as np
 
 from neuralq.runs.folder.files import write_durably
 
-__all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table", "tiles"]
+__all__ = ["Page", "facts_table", "flatten", "format_number", "format_value", "html_table", "short_number", "tiles"]
 
 _STYLE = """
 :root {
@@ -195,6 +195,18 @@ def format_number(value: float, digits: int = 4) -> str:
     if 1e4 <= abs(value) < 1e6:
         return f"{value:,.1f}"
     return f"{value:.{digits}g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
+
+
+def short_number(value: float, digits: int = 4) -> str:
+    """A number rounded to so many significant digits; "unknown" for NaN.
+
+    Example:
+        >>> short_number(0.028261), short_number(18.4449, 2), short_number(float("nan"))
+        ('0.02826', '18', 'unknown')
+    """
+    if math.isnan(value):
+        return "unknown"
+    return format_number(float(f"{value:.{digits}g}") if math.isfinite(value) else value)
 
 
 def format_value(value: Any) -> str:

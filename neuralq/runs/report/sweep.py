@@ -8,7 +8,7 @@ from pathlib import Path
 
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.report.comparison import Group, comparison_svg, read_groups
-from neuralq.runs.report.page import Page, format_number, tiles
+from neuralq.runs.report.page import Page, short_number, tiles
 
 __all__ = ["write_sweep_report"]
 
@@ -45,12 +45,12 @@ def _tiles(group: Group) -> list[tuple[str, str, str]]:
     seconds = sum(run.cpu_seconds for run in group.runs)
     interval = "one seed"
     if found.low is not None and found.high is not None:
-        interval = f"95 % interval {_short(found.low)} to {_short(found.high)}"
-    spread = f"{_short(min(group.returns))} to {_short(max(group.returns))}"
+        interval = f"95 % interval {short_number(found.low)} to {short_number(found.high)}"
+    spread = f"{short_number(min(group.returns))} to {short_number(max(group.returns))}"
     return [
-        ("final return", _short(found.iqm), f"interquartile mean over {len(group.runs)} seeds, {interval}"),
+        ("final return", short_number(found.iqm), f"interquartile mean over {len(group.runs)} seeds, {interval}"),
         ("lowest and highest seed", spread, "final greedy return"),
-        ("environment steps", f"{steps:,}", f"of the longest run; {_short(seconds)} CPU-seconds in all"),
+        ("environment steps", f"{steps:,}", f"of the longest run; {short_number(seconds)} CPU-seconds in all"),
     ]
 
 
@@ -61,12 +61,13 @@ def _seeds(group: Group, folder: Path) -> str:
         page, name = run.path / "report.html", f"seed {run.seed}"
         where = escape(os.path.relpath(page, folder), quote=True)
         told = f'<a href="{where}">{name}</a>' if page.exists() else name
-        cells = (_short(run.returns[-1]), _short(run.returns.max()), f"{run.env_steps:,}", _short(run.cpu_seconds))
+        cells = (
+            short_number(run.returns[-1]),
+            short_number(run.returns.max()),
+            f"{run.env_steps:,}",
+            short_number(run.cpu_seconds),
+        )
         body += f'<tr><th scope="row">{told}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>\n"
     heads = ("", "final return", "best evaluation", "environment steps", "CPU-seconds")
     head = "".join(f'<th scope="col">{one}</th>' for one in heads)
     return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>\n</table></div>'
-
-
-def _short(value: float) -> str:
-    return format_number(float(f"{value:.4g}"))
