@@ -88,7 +88,9 @@ def test_exact_values_of_a_model_are_healthy() -> None:
 
 
 def test_the_caller_has_the_last_word_on_the_discount() -> None:
-    first, second = (examine(lambda s: np.zeros((len(s), 2)), "CartPole-v1", gamma=g, budget_s=2) for g in (None, 0.5))
+    first, second = (
+        examine(lambda s: np.zeros((len(s), 2)), "CartPole-v1", gamma=g, budget_s=0.2) for g in (None, 0.5)
+    )
     assert (first.gamma, second.gamma) == (0.99, 0.5)
 
 
@@ -143,11 +145,11 @@ def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "report.html"
-    command = ["doctor", str(weights), "--env", "CartPole-v1", "--budget", "9s", "--set", "lr=1e-3", "--json"]
+    command = ["doctor", str(weights), "--env", "CartPole-v1", "--budget", "2s", "--set", "lr=1e-3", "--json"]
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["healthy"] is False and said["report"] == str(page) and page.is_file()
-    assert {"R1", "R2", "R6a"} <= {one["id"] for one in said["measured"]}
+    assert "V1" in {one["id"] for one in said["measured"]}
 
 
 def test_the_command_exits_with_2_where_nothing_can_be_loaded(

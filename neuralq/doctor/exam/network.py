@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuralq.doctor.exam.case import CannotMeasure, Case, stacked
+from neuralq.doctor.exam.case import CannotMeasure, Case, seen_at
 from neuralq.doctor.findings import Finding
 from neuralq.lab.networks.sampled import diagnose_sample
 from neuralq.lab.watch.advice import RunTraits, advise
@@ -182,14 +182,16 @@ class _Values(nn.Module):
 
 def _transitions(case: Case, num: int, number: int) -> Transition:
     assert case.subject.encode is not None
-    s, a, r, s_t, ended, _ = stacked((*case.greedy, *case.explored))
+    pool = [*case.greedy, *case.explored]
+    a, r = (np.concatenate([getattr(one, name) for one in pool]) for name in ("actions", "rewards"))
+    ended = np.concatenate([np.arange(one.length) == (one.length - 1 if one.terminated else -1) for one in pool])
     pick = case.rng(number).permutation(len(r))[:num]
     scale = case.settings.reward_scale or 1.0
     discount = np.where(ended[pick], 0.0, case.gamma)
     count = len(pick)
     return Transition(
-        case.subject.encode(s[pick]), torch.as_tensor(a[pick]), torch.ones(count),
-        torch.as_tensor(scale * r[pick]).float(), torch.as_tensor(discount).float(), case.subject.encode(s_t[pick]),
+        case.subject.encode(seen_at(pool, pick)), torch.as_tensor(a[pick]), torch.ones(count),
+        torch.as_tensor(scale * r[pick]).float(), torch.as_tensor(discount).float(), case.subject.encode(seen_at(pool, pick, later=1)),
         torch.as_tensor(ended[pick]),
     )  # fmt: skip
 
