@@ -145,7 +145,7 @@ def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "report.html"
-    command = ["doctor", str(weights), "--env", "CartPole-v1", "--budget", "2s", "--set", "lr=1e-3", "--json"]
+    command = ["doctor", str(weights), "--env", "CartPole-v1", "--budget", "20s", "--set", "lr=1e-3", "--json"]
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["healthy"] is False and said["report"] == str(page) and page.is_file()

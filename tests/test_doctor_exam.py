@@ -466,7 +466,7 @@ def test_states_that_are_seen_as_features_are_answered_exactly_too() -> None:
         return gym.wrappers.TransformObservation(flat, lambda s: 2.0 * s, spaces.Box(0, 2, (16,), np.float64))
 
     q = np.nan_to_num(solve(FiniteMDP.from_gymnasium(gym.make("FrozenLake-v1", is_slippery=False)), GAMMA).q)
-    good, wrong = (case_of(make, lambda s, by=by: by + (s / 2) @ q) for by in (0.0, 2.0))  # type: ignore[misc]
+    good, wrong = (case_of(make, lambda s, by=by: by + (s / 2) @ q) for by in (0.0, 2.0))
     assert exactly.regret(good).value == pytest.approx(0, abs=1e-9)
     assert exactly.against_optimum(good).value == pytest.approx(0, abs=1e-6)
     assert exactly.regret(wrong).value == pytest.approx(0, abs=1e-9)
