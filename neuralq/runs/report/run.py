@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.files import as_float, read_json, read_rows
 from neuralq.runs.folder.run_folder import warn_of_lost_rows
 from neuralq.runs.held import DRAWING_NAME
+from neuralq.runs.kinds import KINDS, kind_in, kind_named
 from neuralq.runs.report.curves import SIGNALS, curve_words, learning_curve_svg, signals_svg
 from neuralq.runs.report.grid import grid_svg
 from neuralq.runs.report.outcome import exact_table, kept_words, network_table, play_off_words, tiles_of, watched_words
@@ -28,7 +30,8 @@ _NAME_KEYS = ("env_id", "environment", "env")
 def write_report(run_dir: str | Path) -> Path:
     """Writes ``report.html`` into a run folder and returns its path; may be called while the run goes on.
 
-    Reads ``metrics.jsonl``, ``config.json``, ``versions.json`` and ``summary.json``; each may still be missing.
+    A run of a kind with a page of its own gets that. Reads ``metrics.jsonl``, ``config.json``, ``versions.json`` and
+    ``summary.json``; each may still be missing.
 
     Raises:
         FileNotFoundError: the folder holds none of them.
@@ -45,6 +48,11 @@ def write_report(run_dir: str | Path) -> Path:
     folder = Path(run_dir)
     if not any((folder / file).exists() for file in _FILES):
         raise FileNotFoundError(f"{folder} is no run folder: it holds none of {', '.join(_FILES)}; pass one that does")
+    command = kind_named(name).command if (name := kind_in(folder)) in KINDS else None
+    if command is not None and command.report is not None:
+        module, _, function = command.report.partition(":")
+        path: Path = getattr(importlib.import_module(module), function)(folder)
+        return path
     rows = read_rows(folder / "metrics.jsonl")
     files = (folder / f"{name}.json" for name in ("config", "versions"))
     config, versions = (read_json(file) if file.exists() else {} for file in files)
