@@ -7,8 +7,9 @@ import contextlib
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_type_hints
 
@@ -41,10 +42,11 @@ def conclude(run: Result, as_json: bool, notes: Sequence[str] = (), **more: Any)
     return 0 if signal_name is None else 128 + signal.Signals[signal_name].value
 
 
-def reported(run: Result) -> str | None:
+def reported(run: Result, film: Callable[[Path], Sequence[tuple[bytes, str]]] | None = None) -> str | None:
     """The page of a run, written; None where there is nothing to draw with, which is said."""
+    folder = Path(run.plain()["run_dir"])
     try:
-        return str(write_report(run.plain()["run_dir"]))
+        return str(write_report(folder, () if film is None else film(folder)))
     except MissingExtra as error:
         say(f"no report: {error}")
         return None

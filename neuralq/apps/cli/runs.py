@@ -12,6 +12,7 @@ from typing import Any
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.doctor import examined
+from neuralq.apps.cli.filmstrip import filmstrip, filmstrip_unasked
 from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, reported, resume_kind, say, train_kind
 from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
@@ -24,7 +25,14 @@ from neuralq.runs.estimate import estimate_policy
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import claimed, read_changes, read_config, read_metrics, refuse_old_run
+from neuralq.runs.folder.run_folder import (
+    claimed,
+    is_run_folder,
+    read_changes,
+    read_config,
+    read_metrics,
+    refuse_old_run,
+)
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
 from neuralq.runs.kinds import KINDS, kind_in, kind_named
 from neuralq.runs.loop import Hook
@@ -207,23 +215,37 @@ def report(argv: list[str]) -> int:
         "report",
         "Write report.html into the folder of a run or of a sweep (extra plot).",
         "neuralq report runs/cart",
+        "neuralq report runs/cart --film",
         "neuralq report runs/cart-10-seeds",
     )
     parser.add_argument("run", help="folder of a run or of a sweep")
+    parser.add_argument(
+        "--film", action="store_true", default=None,
+        help="play an episode and show a few pictures of it; unasked for our own environments, which draw at once",
+    )  # fmt: skip
+    parser.add_argument("--no-film", action="store_false", dest="film", help="show no pictures")
+    add_trust(parser)
     options = parser.parse_args(argv)
-    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else write_report(_reported(options.run))
+    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else _written(options)
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
 
 
-def _reported(path: str) -> Path:
-    """The folder of a run that has a page: one on an environment, or of a kind with its own."""
-    command = kind_named(name).command if (name := kind_in(path)) is not None else None
-    return Path(path) if command is not None and command.report is not None else single_run(path)
+def _written(options: argparse.Namespace) -> Path:
+    """The page of one run, on an environment or of a kind with a page of its own."""
+    command = kind_named(name).command if (name := kind_in(options.run)) is not None else None
+    if command is not None and command.report is not None:
+        if options.film is not None:
+            raise Failure(f"--film is for runs on environments, and {options.run} is none; leave it out", 2)
+        return write_report(options.run)
+    path = single_run(options.run, options.trust)
+    if options.film is None:
+        return write_report(path, filmstrip_unasked(path) if is_run_folder(path) else ())
+    return write_report(path, filmstrip(path) if options.film else ())
 
 
 def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> int:
-    report_path = reported(run)
+    report_path = reported(run, filmstrip_unasked)
     say(run.resumability)
     if run.engine != "compiled" and not forced:
         say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuralq.apps.web.play_turns import WaysToPlay, notation
-from neuralq.figures import COLOURS, MARKERS, draw_svg, steps_axis, tame
-from neuralq.runs.changes import told
+from neuralq.figures import COLOURS, MARKERS, band, draw_svg, steps_axis, tame
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.files import as_float, read_json, read_rows
-from neuralq.runs.folder.run_folder import read_changes, warn_of_lost_rows
+from neuralq.runs.folder.run_folder import warn_of_lost_rows
+from neuralq.runs.report.curves import mark_changes
+from neuralq.runs.report.outcome import sentence
 from neuralq.runs.report.page import Page, facts_table, html_table, short_number, tiles
-from neuralq.runs.report.readings import Row, read_present_summary, rows_by_step
+from neuralq.runs.report.readings import Row, read_present_summary, read_told_changes, rows_by_step
 from neuralq.systems.backgammon.agent import BackgammonAgent, RankedTurn
 from neuralq.systems.backgammon.config import TdGammonConfig, config_from_dict
 from neuralq.systems.backgammon.run import load_agent
@@ -56,8 +57,9 @@ def write_gammon_report(run_dir: str | Path) -> Path:
         agent, why = None, str(error)
     page.table(tiles(_tiles(rows, summary, config, agent)))
     page.heading("Learning curve")
+    changes = read_told_changes(folder)
     page.figure(
-        gammon_svg(rows),
+        gammon_svg(rows, [at for at, _ in changes]),
         "Points per game of money play without a cube: a gammon counts two, a backgammon three. The band is one "
         "standard error wide on each side.",
     )
@@ -69,12 +71,12 @@ def write_gammon_report(run_dir: str | Path) -> Path:
     page.heading("How it was made")
     if agent is not None:
         page.paragraph(_asked(config_from_dict(config)))
+    for _, words in changes:
+        page.paragraph(sentence(words))
     page.folded("Everything that was recorded", facts_table(summary) if summary else "<p>Not recorded.</p>")
     page.folded("Effective configuration", facts_table(config))
     versions = folder / "versions.json"
     page.folded("Versions", facts_table(read_json(versions)) if versions.exists() else "<p>Not recorded.</p>")
-    for row in read_changes(folder):
-        page.paragraph(told(row))
     return page.write(folder / "report.html")
 
 
@@ -160,8 +162,13 @@ def _tiles(
     return found
 
 
-def gammon_svg(rows: Sequence[Row], *, name: str = "learning-curve") -> str:
+def gammon_svg(rows: Sequence[Row], changed_at: Sequence[float] = (), *, name: str = "learning-curve") -> str:
     """Points per game against each opponent over games of self-play, with standard errors.
+
+    Args:
+        rows: of metrics.
+        changed_at: turns behind it when the run went on with other settings; marked at the games of that time.
+        name: prefix of the ids in the SVG.
 
     Raises:
         MissingExtra: matplotlib is not installed.
@@ -173,9 +180,9 @@ def gammon_svg(rows: Sequence[Row], *, name: str = "learning-curve") -> str:
         axes = figure.subplots()
         for number, (opponent, (games, points, errors)) in enumerate(curves.items()):
             colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-            low, high = tame(points - errors), tame(points + errors)
-            axes.fill_between(games, low, high, color=colour, alpha=0.18, linewidth=0)
+            band(axes, games, points - errors, points + errors, colour)
             axes.plot(games, tame(points), color=colour, marker=marker, label=f"against {_named(opponent)}")
+        mark_changes(axes, _games_at(rows, changed_at))
         axes.axhline(0.0, color="#555555", linestyle=":", linewidth=1.2)
         if not curves:
             axes.text(0.5, 0.5, "no match yet", transform=axes.transAxes, ha="center", color="#555555")
@@ -185,6 +192,14 @@ def gammon_svg(rows: Sequence[Row], *, name: str = "learning-curve") -> str:
 
     ends = "; ".join(f"{points[-1]:+.3f} against {_named(name)}" for name, (_, points, _) in curves.items())
     return draw_svg(name, "Learning curve", f"Points per game: {ends or 'no match yet'}.", (5.2, 3.6), paint)
+
+
+def _games_at(rows: Sequence[Row], turns: Sequence[float]) -> list[float]:
+    """Games behind the run after so many turns."""
+    known = np.array([[as_float(row.get(name)) for name in ("env_steps", "games")] for row in rows]).reshape(-1, 2)
+    known = known[np.isfinite(known).all(axis=1)]
+    known = known[np.argsort(known[:, 0], kind="stable")]
+    return [float(np.interp(at, *known.T)) for at in turns] if len(known) else []
 
 
 def _openings(page: Page, agent: BackgammonAgent) -> None:
