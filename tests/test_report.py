@@ -298,7 +298,7 @@ def test_a_sweep_has_a_page_whose_seeds_lead_to_theirs(tmp_path: Path) -> None:
     page = (tmp_path / "s" / "report.html").read_text()
     outline = Outline(page)
     assert "CartPole-v1: 2 seeds" in outline.text and page.count("<svg") == 1
-    assert "none was chosen. Rollout, layout separate, γ = 0.99." in outline.text
+    assert "none was chosen. Rollout, layout action-output, γ = 0.99." in outline.text
     assert "return of the agent" in outline.text
     assert outline.outside == [("href", f"seed-{n}/report.html") for n in (0, 1)]
     assert '<a href="seed-1/report.html">seed 1</a>' in page
