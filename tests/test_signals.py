@@ -84,7 +84,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             EVALUATING.pop()
 
     monkeypatch.setattr(Session, "play_greedily", played)
+    heard = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may have been started by `nohup`
     yield
+    signal.signal(signal.SIGHUP, heard)
     gym.registry.pop("Signalled-v0")
     SENT.clear()
 
