@@ -8,6 +8,7 @@ a return that loses what was earned in an earlier call · anything of a loop tha
 from __future__ import annotations
 
 import dataclasses
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +23,7 @@ from gymnasium import spaces
 
 import neuralq
 from neuralq import RunConfig
-from neuralq.learners import OnlineSettings, RolloutSettings, TabularSettings
+from neuralq.learners import OnlineSettings, RolloutSettings, TabularSettings, learner_kinds
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.control import evaluate_run
@@ -252,6 +253,19 @@ def test_a_table_is_what_the_tabular_learner_learns() -> None:
     with pytest.raises(ValueError, match="episodes of this one end"):
         build_session(config(settings={"algorithm": "r-learning"}))
     assert not build_session(config("neuralq/BlockingMaze-v0")).stream.simulated  # type: ignore[union-attr]
+
+
+def test_where_no_table_is_over_the_observations_every_way_out_is_one(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a table needs a finite observation space, got a Box.*, or discretise") as said:
+        build_session(config("CartPole-v1"))
+    others = re.search(r"choose another learner \((.*?)\)", str(said.value))
+    assert others is not None and others[1].split(", ") == [name for name in learner_kinds() if name != "tabular"]
+    for learner in others[1].split(", "):
+        session = build_session(RunConfig(env="CartPole-v1", learner=learner, resume_probe=False))
+        assert walked(session, 64).env_steps >= 64 and session.stream.spec.num_categories is None
+    halves = gym.wrappers.TransformObservation(gym.make("CartPole-v1"), lambda x: int(x[2] > 0), spaces.Discrete(2))
+    run = neuralq.train(halves, tmp_path / "run", learner="tabular", total_steps=100, evaluation_episodes=1)
+    assert neuralq.load(run.run_dir, env=halves).values(1).shape == (2,)
 
 
 def test_a_run_of_a_table_trains_resumes_and_answers(tmp_path: Path) -> None:
