@@ -22,8 +22,8 @@ import torch
 from gymnasium import spaces
 
 import neuralq
-from neuralq import RunConfig
-from neuralq.learners import OnlineSettings, RolloutSettings, TabularSettings, learner_kinds
+from neuralq import RunConfig, with_preset
+from neuralq.learners import RolloutSettings, TabularSettings, learner_kinds
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.control import evaluate_run
@@ -387,16 +387,46 @@ def test_the_arithmetic_of_blackjack_is_that_of_the_game() -> None:
 
 def test_over_a_table_learners_have_step_sizes_of_their_own_unless_one_is_named() -> None:
     ice = {"env": "FrozenLake-v1", "layout": "table"}
-    assert neuralq.with_preset({**ice, "learner": "online"}).online.step_size == 0.05  # type: ignore[union-attr]
-    named = neuralq.with_preset({**ice, "learner": "online", "online": {"step_size": 0.5}})
-    assert named == RunConfig(**ice, learner="online", online=OnlineSettings(step_size=0.5))
-    assert RunConfig(**ice).rollout.optimiser == "sgd" and RunConfig(env="FrozenLake-v1").rollout == RolloutSettings()
-    few = neuralq.with_preset({**ice, "rollout": {"num_envs": 2, "num_steps": 4}}).rollout
-    assert few is not None and (few.num_minibatches, few.learning_rate) == (1, 0.8)
-    many = neuralq.with_preset({**ice, "rollout": {"num_envs": 64, "num_minibatches": 1}}).rollout
-    assert many is not None and many.learning_rate == 1.0  # all samples may be of one entry
-    grid = neuralq.with_preset({"env": "neuralq/MitchellGrid-v0", "layout": "table"}).rollout
-    assert grid == neuralq.with_preset({"env": "neuralq/MitchellGrid-v0"}).rollout  # its preset names one
+    own = {name: with_preset({**ice, "learner": name}).settings for name in learner_kinds() if name != "tabular"}
+    steps = {name: (getattr(one, "step_size", None), getattr(one, "anneal", None)) for name, one in own.items()}
+    by_steps = {"online", "streaming", "gradient"}
+    assert {name for name, found in steps.items() if found == (0.1, True)} == by_steps
+    assert own["gradient"].step_size_h == 0.01  # a tenth, as with networks
+    for name in own:
+        assert own[name] != RunConfig(env="FrozenLake-v1", learner=name).settings
+        size = "step_size" if name in by_steps else "learning_rate"
+        named = with_preset({**ice, "learner": name, name: {size: 0.5}})
+        assert named == RunConfig(**ice, learner=name, **{name: learner_kinds()[name].settings(**{size: 0.5})})
+    assert own["rollout"].optimiser == "sgd" and RunConfig(env="FrozenLake-v1").rollout == RolloutSettings()
+    few = with_preset({**ice, "rollout": {"num_envs": 2, "num_steps": 4}}).settings
+    assert (few.num_minibatches, few.learning_rate) == (1, pytest.approx(8 * 0.03))
+    many = with_preset({**ice, "rollout": {"num_envs": 64, "num_minibatches": 1}}).settings
+    assert many.learning_rate == 1.0  # all samples may be of one entry
+    grid = with_preset({"env": "neuralq/MitchellGrid-v0", "layout": "table"}).rollout
+    assert grid == with_preset({"env": "neuralq/MitchellGrid-v0"}).rollout  # its preset names one
+
+
+@pytest.mark.parametrize(
+    ("learner", "given", "expected"),
+    [
+        ("replay", {}, {"learning_rate": 1.6, "target_rate": 1.0, "loss": "squared", "batch_size": 32}),
+        ("replay", {"batch_size": 8}, {"learning_rate": 0.4}),
+        ("replay", {"batch_size": 256}, {"learning_rate": 1.6}),  # all samples may be of one entry
+        ("replay", {"target_period_updates": 50}, {"target_rate": None, "target_period_updates": 50}),
+        ("replay", {"target_rule": "retrace", "block_length": 40}, {"batch_size": 40, "learning_rate": 1.6}),
+        ("replay", {"target_rule": "dqrc"}, {"optimiser": "adam", "learning_rate": 5e-4, "average_updates": None}),
+        ("replay", {"distribution": "quantile"}, {"optimiser": "adam", "learning_rate": 5e-4}),
+        ("replay", {"optimiser": "adam"}, {"learning_rate": 5e-4, "batch_size": 64}),
+        ("rollout", {"optimiser": "adam"}, {"learning_rate": 1e-3, "returns": "peng"}),
+        ("gradient", {"method": "gq"}, {"lambda_": 0.0, "step_size": 0.1, "anneal": True}),
+        ("online", {"trace": "dutch"}, {"step_size": 0.1, "anneal": False}),
+    ],
+)
+def test_step_sizes_over_a_table_go_with_what_is_given(
+    learner: str, given: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    found = with_preset({"env": "FrozenLake-v1", "layout": "table", "learner": learner, learner: given}).settings
+    assert {name: getattr(found, name) for name in expected} == expected
 
 
 @pytest.mark.slow
