@@ -1,8 +1,8 @@
 """Step sizes that fall over a run, of the learners that take one step at a time.
 
 Mutants that must die here: a step late or early · a row in which nothing was done counted · a step size that turns
-negative past the end · only one of the two step sizes of gradient TD · a count that is forgotten on resuming · an option
-that does nothing.
+negative past the end · only one of the two step sizes of gradient TD · a count that is forgotten on resuming · an
+option that does nothing.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ QUANTILES = ["--replay.distribution", "quantile", "--replay.num-atoms", "5", "--
     ids=["dueling quantiles", "noisy", "rainbow"],
 )
 def test_dueling_streams_of_a_distribution_and_noisy_layers(agent: list[str], tmp_path: Path, capsys: Capture) -> None:
-    """The former are reshaped twice, and neither may remember the batch that was traced; the latter play their means."""
+    """Both parts of the former are reshaped and may not remember a traced batch; the latter play by their means."""
     words = ["--total-steps", "40", "--replay.learning-starts", "20", "--hidden", "8", "--evaluation-episodes", "1"]
     assert main(["train", "CartPole-v1", *agent, *words, "--run-dir", str(tmp_path / "run")]) == 0
     capsys.readouterr()

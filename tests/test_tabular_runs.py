@@ -256,7 +256,7 @@ def test_a_table_is_what_the_tabular_learner_learns() -> None:
 
 
 def test_where_no_table_is_over_the_observations_every_way_out_is_one(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"a table needs a finite observation space, got a Box.*, or discretise") as said:
+    with pytest.raises(ValueError, match=r"needs a finite observation space, got a Box.*, or discretise") as said:
         build_session(config("CartPole-v1"))
     others = re.search(r"choose another learner \((.*?)\)", str(said.value))
     assert others is not None and others[1].split(", ") == [name for name in learner_kinds() if name != "tabular"]

@@ -74,7 +74,7 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
 
 
 def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain steps that bring an entry a twentieth nearer to each of its samples, all of which are kept; an average plays.
+    """Plain steps that bring an entry a twentieth nearer to each of its samples, all of them kept; an average plays.
 
     A step moves no other entry, so that targets need no frozen copy. An entry that all samples of a batch are of moves
     by 1.6 of the way at most, which still brings it nearer.
