@@ -129,6 +129,7 @@ class Balanced(HTMLParser):
         (["ase-ace", "--seeds", "0"], "--seeds must be at least 1, got 0"),
         (["ase-ace", "--svg", "x.svg"], "--svg is for figures and exercises; ase-ace writes a page: --html FILE"),
         (["--html", "x.html"], "need a name"),
+        (["ase-ace", "--html", "."], "is a folder; name a file: --html FILE"),
     ],
 )
 def test_what_does_not_go_together_is_refused_in_one_line(argv: list[str], said: str, capsys: Capture) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
 import textwrap
@@ -19,6 +20,7 @@ from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.apps.pages.html import page_html
 from neuralq.apps.pages.svg import page_svg
 from neuralq.apps.pages.text import drawing_lines, shown
+from neuralq.figures import draw_svg
 from neuralq.runs.report.claims import ChapterPage, Picture
 from neuralq.systems import SYSTEMS, run_system, system_named
 
@@ -33,10 +35,14 @@ def chapter(argv: list[str]) -> int:
     options = _read(argv)
     if options.page is None:
         return _list(options)
+    written = options.html or (str(_FOLDER / f"{options.page}.html") if options.page in SYSTEMS else None)
+    if written is not None:
+        _make_room(Path(written))
     began = time.perf_counter()
     page = _run_system(options) if options.page in SYSTEMS else run_page(options.page)
     plain = {**page.plain(), "seconds": time.perf_counter() - began}
-    written = options.html or (str(_FOLDER / f"{options.page}.html") if options.page in SYSTEMS else None)
+    if not options.json:
+        _print(page)
     lines = []
     if options.svg is not None:
         Path(options.svg).write_text(page_svg(page), encoding="utf-8")
@@ -46,8 +52,6 @@ def chapter(argv: list[str]) -> int:
         page_html(page, shlex.join(["neuralq", "chapter", *argv])).write(Path(written))
         plain["html"] = written
         lines.append(f"page: {written}")
-    if not options.json:
-        _print(page)
     print_result(plain, options.json, lines)
     if page.wrong:
         raise Failure(f"{options.page}: not reproduced: {'; '.join(page.wrong)}")
@@ -89,6 +93,13 @@ def _read(argv: list[str]) -> argparse.Namespace:
     return options
 
 
+def _make_room(path: Path) -> None:
+    """The folder that a page goes to; what cannot be written is said before anything is trained."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise Failure(f"{path} {'is a folder' if path.is_dir() else 'cannot be written'}; name a file: --html FILE", 2)
+
+
 def _list(options: argparse.Namespace) -> int:
     tables = {
         "pages": {name: entry.summary for name, entry in PAGES.items()},
@@ -102,6 +113,7 @@ def _list(options: argparse.Namespace) -> int:
 
 def _run_system(options: argparse.Namespace) -> ChapterPage:
     """Trained under a progress bar, which is made when it is known how much there is to do."""
+    draw_svg("nothing", "", "", (1.0, 1.0), lambda figure: None)  # without matplotlib, said now and not at the end
     system = system_named(options.page)
     num_seeds = options.seeds or (system.full_num_seeds if options.full else system.num_seeds)
     total = num_seeds * len(system.contenders)

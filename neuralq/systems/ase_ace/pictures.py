@@ -90,10 +90,13 @@ def boxes_picture(elements: AseAce) -> Picture:
     lowest = min(float(p.min()), -1e-9)
 
     def paint(figure: Figure) -> None:
+        from matplotlib.colors import LinearSegmentedColormap
+
+        red = LinearSegmentedColormap.from_list("red", ("#cb181d", "#ffffff"))  # as strong where the page inverts it
         grid = figure.subplots(3, 3, sharex=True, sharey=True)
         for (x_dot, x), axes in np.ndenumerate(grid):
             shown = axes.pcolormesh(
-                p[:, :, x_dot, x], cmap="Reds_r", vmin=lowest, vmax=0, edgecolor="#bbbbbb", linewidth=0.3
+                p[:, :, x_dot, x], cmap=red, vmin=lowest, vmax=0, edgecolor="#bbbbbb", linewidth=0.3
             )
             _arrows(axes, w[:, :, x_dot, x], p[:, :, x_dot, x] < 0.6 * lowest)
             axes.set_xticks(range(7), ["−12", "−6", "−1", "0", "1", "6", "12"], fontsize=7)
@@ -118,8 +121,8 @@ def boxes_picture(elements: AseAce) -> Picture:
     svg = draw_svg("boxes", "What both elements learned", described, (5.2, 5.4), paint)
     caption = (
         "What one training has learned. Nine panels for where the cart is (across) and how fast it moves (down); "
-        "within each, the angle of the pole across and its angular velocity upwards. Redder: the critic expects a "
-        "fall. Arrow: the way that is pushed; a dot where it was never told anything."
+        "within each, the angle of the pole across and its angular velocity upwards. Colour: how surely the critic "
+        "expects a fall. Arrow: the way that is pushed; a dot where it was never told anything."
     )
     return Picture("What both elements learned", svg, caption)
 
