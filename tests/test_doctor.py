@@ -83,7 +83,7 @@ def test_what_could_not_be_measured_is_listed_with_the_reason_and_blocks_nothing
 
 def test_the_summary_fits_one_screen_and_progress_reaches_its_end(sick: Report, told: list[tuple[int, str]]) -> None:
     lines = sick.explain().splitlines()
-    assert len(lines) <= 45 and max(map(len, lines)) <= 115
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
     assert all(any(line.startswith(cause) for line in lines) for cause in CAUSES)
     assert [so_far for so_far, _ in told] == list(range(NUM_PARTS))
 
