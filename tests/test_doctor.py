@@ -45,8 +45,9 @@ def few_episodes() -> Iterator[None]:
 
 @pytest.fixture
 def without_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the one measurement that always trains a network, which takes more time than all others."""
-    monkeypatch.delitem(examination._MEASUREMENTS, "R5")
+    """Without the measurements that train networks, which take more time than all others."""
+    for name in ("R5", "R7"):
+        monkeypatch.delitem(examination._MEASUREMENTS, name)
 
 
 @pytest.fixture(scope="module")
