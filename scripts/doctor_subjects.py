@@ -309,7 +309,7 @@ def well(control: Control, seed: int, folder: Path) -> Path:
 
     path = folder / "agent.zip"
     if control.trainer == "neuralq":
-        around = {"env_kwargs": control.env_kwargs} if control.env_kwargs else {}
+        around: dict[str, Any] = {"env_kwargs": control.env_kwargs} if control.env_kwargs else {}
         neuralq.train(control.env, path, seed=seed, resume_probe=False, **control.given, **around)
     else:
         _sb3(control.make, control.given, seed, control.steps, path)
