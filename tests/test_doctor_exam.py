@@ -501,7 +501,7 @@ def test_the_first_cause_comes_first() -> None:
     assert first(wrong, flagged("V3", "algorithm"), flagged("V5", "algorithm")) == "V5"
     assert first(wrong, flagged("D3", "data"), flagged("R1", "algorithm")) == "D3"
     assert first(wrong, flagged("R7", "representation"), flagged("V6a", "algorithm")) == "R7"
-    assert first(flagged("R7", "representation"), flagged("V3", "algorithm")) == "V3"
+    assert first(flagged("V4", "algorithm", value=5.0), flagged("R7", "representation"), calm("R1")) == "R7"
     assert first(flagged("E4", "representation", "C", 1e4), wrong) == "E4"
     assert first(flagged("E4", "representation", "C", 50.0), wrong) == "V2"  # beyond the threshold, not far beyond
     assert first(flagged("X3", "algorithm", "A"), flagged("E6", "environment")) == "X3"
