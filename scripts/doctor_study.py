@@ -2,13 +2,11 @@
 
     python scripts/doctor_study.py --seeds 5 --out doctor_study.json
     python scripts/doctor_study.py --only 1 7 healthy --seeds 1
-    python scripts/doctor_study.py --network-verdict 300
 
 Subjects are trained by Stable-Baselines3 where it is installed and can express the disease (extra bench), else by the
 plain DQN below, so that the doctor is not judged on neuralq's own learner. Each row is printed as it is known: disease,
 seed, what was named first, whether that is the expected cause. Thresholds are read on even seeds and reported on odd
-ones with --split. With --network-verdict the lab's verdict before training is held against what training did, on random
-finite problems: area under the ROC curve and a table of predicted growth against the share that diverged.
+ones with --split.
 """
 
 from __future__ import annotations
@@ -30,7 +28,6 @@ from gymnasium.wrappers import TransformObservation, TransformReward
 from torch import nn
 
 from neuralq.doctor import Settings, examine
-from neuralq.doctor.estimates import area_under_curve
 from neuralq.doctor.subject import of_network
 
 GAMMA, LIMIT = 0.99, 100
@@ -267,54 +264,17 @@ def healthy(env: str, seed: int, budget_s: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def network_verdict(num_problems: int, seed: int = 0) -> dict[str, Any]:
-    """The lab's verdict at the start against training, on random finite problems and three layouts."""
-    from neuralq.lab.networks.diagnosis import diagnose_network
-    from neuralq.lab.networks.expected import expected_backup, expected_td_step
-    from neuralq.lab.networks.tangent_kernel import observations_of
-    from neuralq.lab.problems import Problem
-    from neuralq.mdp import FiniteMDP
-    from neuralq.q import MLP, ActionInputQ, ActionOutputQ, SeparateQ
-
-    rng, rows = np.random.default_rng(seed), []
-    for i in range(num_problems):
-        model = FiniteMDP.garnet(8, 2, 3, seed=seed + i)
-        features = rng.standard_normal((8, 3))
-        problem = Problem.from_mdp(model, features, gamma=float(rng.choice([0.9, 0.99])))
-        for layout in (ActionOutputQ, SeparateQ, ActionInputQ):
-            q = layout((3,), 2, body=MLP(hidden=(16,)), rng=i, dtype=torch.float64)
-            seen = observations_of(problem)
-            found = diagnose_network(q, problem, 0.05, observations=seen, curvature=False)
-            backup = expected_backup(problem, seen, state_values=False)
-            before = found.largest_error
-            for _ in range(500):
-                expected_td_step(q, backup, 0.05)
-            after = diagnose_network(q, problem, 0.05, observations=seen, curvature=False).largest_error
-            rows.append((found.kernel_growth, bool(not np.isfinite(after) or after > 2 * before), layout.__name__))
-    growth, diverged = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-    both = 0 < diverged.sum() < len(diverged)
-    return {
-        "problems": num_problems, "rows": len(rows), "diverged": int(diverged.sum()),
-        "auc": area_under_curve(growth, diverged) if both else None,
-        "missed": int((diverged & (growth <= 1)).sum()), "false alarms": int((~diverged & (growth > 1)).sum()),
-    }  # fmt: skip
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[*DISEASES, "healthy"], help="diseases by number, or healthy")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=30_000, help="environment steps of each subject")
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of each examination")
-    parser.add_argument("--network-verdict", type=int, metavar="N", help="instead: N random problems for the lab")
     parser.add_argument("--split", action="store_true", help="confusion of odd seeds alone")
     parser.add_argument("--out", type=Path, help="rows as JSON")
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    if options.network_verdict is not None:
-        print(json.dumps(network_verdict(options.network_verdict)))
-        return
     rows = []
     for number in options.only:
         for seed in range(options.seeds):
