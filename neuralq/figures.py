@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "MARKERS", "draw_png", "draw_svg", "scale_axis", "steps_axis", "tame"]
+__all__ = ["COLOURS", "MARKERS", "at_least", "draw_png", "draw_svg", "scale_axis", "steps_axis", "tame"]
 
 # Okabe and Ito (2008), "Color universal design": told apart with every common colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -120,6 +120,16 @@ def _inline(text: str, name: str, title: str, description: str) -> str:
         f'<title id="{name}-title">{escape(title)}</title>\n<desc id="{name}-description">{escape(description)}</desc>'
     )
     return head + text[text.index(">") + 1 :].rstrip()
+
+
+def at_least(svg: str, pixels: int) -> str:
+    """The same element, never narrower than so many pixels: where there is less room, what holds it has to scroll.
+
+    Example:
+        >>> at_least('<svg viewBox="0 0 1 1">', 500)
+        '<svg style="min-width:500px" viewBox="0 0 1 1">'
+    """
+    return svg.replace("<svg ", f'<svg style="min-width:{pixels}px" ', 1)
 
 
 def _prefixed(attribute: str, value: str, name: str) -> str:

@@ -43,7 +43,7 @@ def main() -> None:
     )
     run = neuralq.train(config, options.run_dir)
     print(run.run_dir)
-    print(f"{run.env_steps:,} steps in {run.cpu_seconds:.1f} CPU-seconds; greedy return {run.greedy_return:.1f}")
+    print(f"{run.env_steps:,} steps in {run.cpu_seconds:.1f} CPU-seconds; greedy return {run.agent_return:.1f}")
 
     agent = neuralq.load(run.run_dir)
     env = gymnasium.make(options.env)

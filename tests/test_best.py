@@ -25,10 +25,12 @@ from neuralq.learners import RolloutSettings
 from neuralq.q import MLP
 from neuralq.runs import RunConfig, evaluate_run, load, resume, train
 from neuralq.runs import loop as training
-from neuralq.runs.evaluation import Evaluation, play_off
+from neuralq.runs.evaluation import Evaluation
 from neuralq.runs.folder.best import Best, keep_best, load_best
 from neuralq.runs.folder.checkpoint import CheckpointError, load_newest
+from neuralq.runs.play_off import play_off
 from neuralq.runs.recipe.build import build_session
+from neuralq.runs.report.comparison import read_groups
 from neuralq.runs.session import Session
 from neuralq.runs.stop_request import StopRequest
 
@@ -93,11 +95,17 @@ def test_a_run_that_ends_below_its_best_keeps_the_better(tmp_path: Path, monkeyp
     assert played[::2] == played[1::2] and len(set(played[::2])) == len(played) // 2  # both met the same, each anew
     episodes = 2 * -(-(run.env_steps // 2) // 4)  # of one step each, two of each agent a round: half of training
     assert run.play_off["num_episodes"] == sum(n for n, _ in played[::2]) == episodes
+    error = 0.05 / (episodes - 1) ** 0.5  # of 9 and 9.1 in turn
+    assert run.agent_return == pytest.approx(9.05) and run.agent_standard_error == pytest.approx(error)
+    assert f"greedy return 9.1 ± {error:.2g} of the best parameters" in run.lines()[0]
+    assert "(last evaluation 7.0)" in run.lines()[0]
+    group = read_groups([tmp_path / "run"])[0][0].plain()
+    assert group["agent_returns"] == [pytest.approx(9.05)] == [group["iqm"]] and group["greedy_returns"] == [7.0]
     assert run.parameters_sha256 == resume_sha(tmp_path / "run")
     for best, kept in (None, seen[1]), (True, seen[1]), (False, seen[3]):
         assert flat_parameters(load(tmp_path / "run", best)) == sorted(kept.tolist())
     again = resume(tmp_path / "run", total_steps=80)  # from where it ended, and decides anew
-    assert again.agent == "final" and again.play_off is None
+    assert again.agent == "final" and again.play_off is None and again.agent_return == again.greedy_return == 9.5
     assert flat_parameters(load(tmp_path / "run")) == sorted(seen[4].tolist())
 
 

@@ -1,9 +1,9 @@
 """The monitor of a run: it sees divergence where there is some, says so once, and changes nothing.
 
 Mutants that die here: a kernel with its successors on the wrong side · successors after the end that count · the mean
-of the next values for their maximum · a bound without the discount · one that forgets the reward's scale, or takes an
-n-step reward for a step's · an alarm at every row · one for values that only rise to their level · a generator shared
-with the run · a look at padding rows · two monitors of one run, or none · more than its share of the CPU time.
+of the next values for their maximum · a bound without the discount · rewards as they were scaled · an n-step reward
+taken for a step's · an alarm at every row · one for values that only rise to their level · a generator shared with
+the run · a look at padding rows · two monitors of one run, or none · more than its share of the CPU time.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ def w_to_2w(gamma: float) -> Transition:
     return transitions([[1.0], [2.0]], [[2.0], [2.0]], discount=gamma)
 
 
-def row(steps: int, error: float = 1.0, max_q: float = 1.0, **more: Any) -> dict[str, Any]:
-    return {"kind": "train", "env_steps": steps, "num_updates": steps, "abs_td_error": error, "max_q": max_q, **more}
+def row(steps: int, error: float = 1.0, max_abs_q: float = 1.0, **more: Any) -> dict[str, Any]:
+    columns = {"abs_td_error": error, "max_abs_q": max_abs_q}
+    return {"kind": "train", "env_steps": steps, "num_updates": steps, **columns, **more}
 
 
 def quiet(monitor: DivergenceMonitor, *rows: dict[str, Any]) -> list[str]:
@@ -166,21 +167,48 @@ def test_growth_is_fitted_and_told_from_learning() -> None:
 def test_soft_divergence_is_said_once_with_the_bound() -> None:
     monitor = DivergenceMonitor(TRAITS, largest_reward=2.0, margin=1.0)
     assert monitor.bound == pytest.approx(20)
-    assert quiet(monitor, row(1, max_q=20.0)) == []
-    assert quiet(monitor, row(2, max_q=-20.5), row(3, max_q=30.0), row(4, max_q=40.0)) == ["soft divergence"]
+    assert quiet(monitor, row(1, max_abs_q=20.0)) == []
+    assert quiet(monitor, row(2, max_abs_q=20.5), row(3, max_abs_q=30.0)) == ["soft divergence"]
     assert monitor.alarms[0].env_steps == 2 and "20.5" in monitor.alarms[0].message
-    assert quiet(DivergenceMonitor(TRAITS, largest_reward=2.0), row(1, max_q=21.9)) == []  # within the margin
-    scaled = DivergenceMonitor(RunTraits(gamma=0.9, step_size=0.1, reward_scale=0.1), largest_reward=2.0)
-    assert scaled.bound == pytest.approx(2)
+    assert quiet(DivergenceMonitor(TRAITS, largest_reward=2.0), row(1, max_abs_q=21.9)) == []  # within the margin
     assert DivergenceMonitor(RunTraits(gamma=1.0, step_size=0.1), largest_reward=2.0).bound is None
 
 
+def test_all_is_told_in_the_units_of_the_environment() -> None:
+    """Rewards that the stream multiplied by 4 and the learner by 0.1: 2 and 8 in what it is shown are 0.5 and 2."""
+    traits = RunTraits(gamma=0.9, step_size=0.1, reward_scale=0.1)
+    assert DivergenceMonitor(traits, largest_reward=2.0).bound == pytest.approx(20)
+    monitor = DivergenceMonitor(traits, margin=1.0)
+    for reward in (2.0, 8.0, 4.0):
+        shown = transitions([[1.0]] * 2, [[1.0]] * 2, r=[0.0, reward])
+        monitor.observe(learner_of(LinearQ(1, 1)), Sample(shown, reward_scale=4.0))
+    assert monitor.bound == pytest.approx(20)
+    assert quiet(monitor, row(1, max_abs_q=19.5)) == []
+    assert "was 19.5; by the rewards of the same steps no return exceeds 20." in monitor.explain()
+    assert (monitor.verdict()["largest_value"], monitor.report()["bound"]) == (19.5, pytest.approx(20))
+    assert quiet(monitor, row(2, max_abs_q=20.5)) == ["soft divergence"]
+    assert "|Q| is 20.5" in monitor.alarms[0].message and "r_max/(1 − γ) = 20." in monitor.alarms[0].message
+
+
+@pytest.mark.parametrize("scaled", [{"reward_scale": 0.01}, {"learner": "streaming"}], ids=["scaled", "normalised"])
+def test_what_it_says_of_values_repeats_and_is_of_the_values(scaled: dict[str, Any], tmp_path: Path) -> None:
+    """CartPole's rewards are all 1, so no return exceeds 1/(1 − γ) however they are scaled for learning."""
+    config = RunConfig(
+        total_steps=256, log_every=32, evaluate_every=256, evaluation_episodes=1, gamma=0.9, body=MLP((8,)), **scaled
+    )
+    one, two = (train(config, tmp_path / name).monitor for name in ("one", "two"))
+    assert one is not None and two is not None
+    assert one["bound"] == two["bound"] == pytest.approx(10, rel=1e-3)
+    rows = [row for row in read_metrics(tmp_path / "one") if row["kind"] == "train"]
+    assert one["largest_value"] == two["largest_value"] == max(row.get("max_abs_q", 0.0) for row in rows) > 0
+
+
 def test_growth_is_said_once_for_each_measure_and_not_below_the_bound() -> None:
-    rows = [row(i, error=np.exp(0.3 * i), max_q=np.exp(0.2 * i)) for i in range(30)]
+    rows = [row(i, error=np.exp(0.3 * i), max_abs_q=np.exp(0.2 * i)) for i in range(30)]
     monitor = DivergenceMonitor(TRAITS)
     assert quiet(monitor, *rows) == ["growth of abs_td_error", "growth of largest_value"]
     assert "doubles every 2.31 updates" in monitor.alarms[0].message
-    low = [row(i, error=1e-6 * np.exp(0.3 * i), max_q=1e-6 * np.exp(0.2 * i)) for i in range(30)]
+    low = [row(i, error=1e-6 * np.exp(0.3 * i), max_abs_q=1e-6 * np.exp(0.2 * i)) for i in range(30)]
     assert quiet(DivergenceMonitor(TRAITS, largest_reward=1.0), *low) == []  # values that start at 0 have to grow
     decay = [row(i, error=np.exp(-0.3 * i)) for i in range(30)]
     assert quiet(DivergenceMonitor(TRAITS), *decay) == []
@@ -188,7 +216,7 @@ def test_growth_is_said_once_for_each_measure_and_not_below_the_bound() -> None:
 
 def test_numbers_that_are_no_longer_finite_are_said_and_kept_out_of_the_report() -> None:
     monitor = DivergenceMonitor(TRAITS, largest_reward=1.0)
-    kinds = quiet(monitor, row(1), row(2, error=np.nan, max_q=np.inf), row(3, error=np.inf))
+    kinds = quiet(monitor, row(1), row(2, error=np.nan, max_abs_q=np.inf), row(3, error=np.inf))
     assert kinds == ["not finite"]
     monitor.inspect(LinearQ(1, 1), transitions([[0.0]] * 2, [[0.0]] * 2))  # nothing can move: every step size will do
     json.dumps(monitor.report(), allow_nan=False)
@@ -255,7 +283,7 @@ def test_padding_rows_are_not_looked_at_and_single_steps_are_collected() -> None
     padded = transitions([[1.0], [1e6]], [[1.0], [1e6]], r=[1.0, 1e6])
     monitor.observe(learner_of(q), Sample(padded, torch.tensor([1.0, 0.0])))
     assert quiet(monitor, row(1)) == [] and monitor.bound == pytest.approx(10)
-    assert monitor.report()["largest_value"] == 1.0 and monitor.diagnoses == []
+    assert monitor.diagnoses == []
     monitor.observe(learner_of(q), Sample(padded, torch.zeros(2)))  # nothing at all
     for _ in range(7):
         monitor.observe(learner_of(q), Sample(transitions([[1.0]], [[0.5]], r=1.0)))
@@ -341,6 +369,7 @@ def test_unasked_it_spends_no_more_than_its_share(monkeypatch: pytest.MonkeyPatc
             now[0] += 0.1
 
     monkeypatch.setattr(monitor, "_observe", observe)
+    monkeypatch.setattr(monitor, "_note_rewards", lambda sample: None)
     for k in range(1, 401):
         monitor.observe(None, None)  # type: ignore[arg-type]
         quiet(monitor, {**row(k), "cpu_seconds": 0.2 * k})
@@ -350,7 +379,7 @@ def test_unasked_it_spends_no_more_than_its_share(monkeypatch: pytest.MonkeyPatc
 
 def test_what_was_said_is_remembered_by_a_resumed_run() -> None:
     first = DivergenceMonitor(TRAITS, largest_reward=1.0, every=1)
-    assert quiet(first, row(1, max_q=50.0)) == ["soft divergence"]
+    assert quiet(first, row(1, max_abs_q=50.0)) == ["soft divergence"]
     first.observe(learner_of(LinearQ(1, 1)), Sample(w_to_2w_rows()))
     quiet(first, row(1))
     assert first.columns() == {"alarm": "soft divergence"} and first.verdict()["advice"][0] == "a target network"
@@ -359,7 +388,7 @@ def test_what_was_said_is_remembered_by_a_resumed_run() -> None:
     assert again.verdict()["alarms"] == ["soft divergence"] and again.report()["kernels"] == first.report()["kernels"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        again({**row(2, max_q=60.0), "cpu_seconds": 100.0})
+        again({**row(2, max_abs_q=60.0), "cpu_seconds": 100.0})
     assert len(again.alarms) == 1 and not again._run_seconds  # the hundred seconds were before it came
 
 

@@ -19,13 +19,16 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from neuralq.apps.cli import main
 from neuralq.apps.pages import star
 from neuralq.apps.pages.star import divergence_svg, growth_table, values_table, write_demo_report
 from neuralq.checks import MissingExtra
+from neuralq.mdp import FiniteMDP
 from neuralq.runs.folder.files import RunFolderError
 from neuralq.runs.report import (
     learning_curve_svg,
@@ -163,13 +166,16 @@ EXACT = {
 }  # fmt: skip
 GRID = {
     "num_columns": 2, "signs": ["", "H", "", "G"], "arrows": [2, None, 1, None], "optimal": [True, None, False, None],
-    "learned": [1.0, None, 2.5, None], "exact": [1.5, None, 2.5, None], "visited": [True, False, False, False],
+    "learned": [1.0, None, 2.5, None], "error": [0.5, None, 0.0, None], "visited": [True, False, False, False],
 }  # fmt: skip
 
 
 def test_the_page_begins_with_what_a_person_wants(tmp_path: Path) -> None:
     run = make_run(tmp_path, [train_row(64), evaluation_row(64, [9.0]), evaluation_row(128, [0.0, 1.0, 1.0, 0.0])])
-    off = {"agent": "best", "final_return": 0.5, "best_return": 9.0, "num_episodes": 100, "standard_error": 0.125}
+    off = {
+        "agent": "best", "final_return": 0.5, "best_return": 9.0, "num_episodes": 100, "standard_error": 0.125,
+        "best_standard_error": 0.25, "final_standard_error": 0.75,
+    }  # fmt: skip
     monitor = {"alarms": [{"kind": "soft divergence"}], "seen": "It grew.", "advice": ["a target network"]}
     (run / "summary.json").write_text(
         json.dumps({"exact": EXACT, "play_off": off, "monitor": monitor, "env_steps": 128})
@@ -178,16 +184,53 @@ def test_the_page_begins_with_what_a_person_wants(tmp_path: Path) -> None:
     text = check_page(page := write_report(run).read_text()).text
     error = math.sqrt(1 / 3) / 2  # of two zeros and two ones
     for words in (
-        f"0.5 ± {error:.2g}", "4 episodes at 128 steps", "at 64 steps", "exactly 5", "soft divergence",
-        "the last parameters score 0.5 and the best 9, with a standard error of 0.12 of the difference: the best are",
-        "worth 4 by what was learned, and 5 exactly. The greedy policy earns 3 less",
+        "kept scores 9 ± 0.25 per episode (the best parameters, 100 fresh episodes", "return of the agent9 ± 0.25",
+        f"last evaluation0.5 ± {error:.2g}", "4 episodes at 128 steps", "at 64 steps", "exactly 5", "soft divergence",
+        "the last parameters score 0.500, the best 9.0, ± 0.12 between them: the best are the run's agent",
+        "Value of the start 4.0, exactly 5.0; the greedy policy earns 3 less",
+        "the largest |Q − Q*| over its actions",
         "It grew. What may help: a target",
     ):  # fmt: skip
         assert words in text, words
     rows = re.findall(r"<th scope=\"row\">([^<]*)</th><td>([^<]*)</td><td>([^<]*)</td>", page)
     assert ("mean |Q − Q*|", "0.25", "1") in rows and ("states with an optimal action", "75%", "50%") in rows
     assert 'id="grid"' in page and "errors up to 0.5." in text and "data:" not in page
-    assert page.index("0.5 ±") < page.index("Learning curve") < page.index("Everything that was recorded")
+    assert (
+        page.index("9 ± 0.25")
+        < page.index("0.5 ±")
+        < page.index("Learning curve")
+        < page.index("Everything that was recorded")
+    )
+
+
+def test_a_summary_that_the_run_has_gone_beyond_is_not_told(tmp_path: Path) -> None:
+    run = make_run(tmp_path, [evaluation_row(128, [1.0]), evaluation_row(256, [3.0])])
+    off = {"agent": "best", "best_return": 9.0, "num_episodes": 100, "standard_error": 0.125, "final_return": 1.0}
+    for steps, told in (128, False), (256, True):
+        (run / "summary.json").write_text(json.dumps({"play_off": off, "env_steps": steps}))
+        text = check_page(write_report(run).read_text()).text
+        assert ("return of the agent9" in text) == told and ("return per episode3" in text) == (not told)
+
+
+def test_a_map_shows_the_error_of_action_values_and_scrolls_where_it_is_wide() -> None:
+    from neuralq.exact import solve
+    from neuralq.runs.beside import Beside
+    from neuralq.runs.stream import Interaction, make_vector_env
+
+    env = gym.make("CliffWalking-v1")
+    envs = make_vector_env(lambda: env, 1)
+    beside = Beside.of(envs, Interaction(envs, 1.0, 0, as_index=True).spec, 1.0)
+    assert beside is not None
+    q = solve(FiniteMDP.from_gymnasium(env), 1.0).q + np.array([0.25, -0.5, 0.0, 0.0])
+    held = beside.held(torch.from_numpy(q).__getitem__, 1.0)
+    assert held is not None
+    drawing = held.drawing()
+    assert drawing is not None and drawing["visited"] is None  # nobody watched
+    errors = [x for x in drawing["error"] if x is not None]
+    assert len(errors) == 37 and errors == pytest.approx([0.5] * 37)  # of up and right, the larger
+    found = grid_svg(drawing)
+    assert found is not None and "min-width:552px" in found[0] and "errors up to 0.5." in found[0]
+    assert "never visited" not in found[1] and "never visited" in grid_svg(GRID)[1]  # type: ignore[index]
 
 
 def test_a_band_of_zeros_and_ones_is_their_standard_error(tmp_path: Path) -> None:

@@ -27,12 +27,13 @@ class Update:
     targets: Tensor
 
     def metrics(self) -> Metrics:
-        """``loss`` ½·mean(e²), ``abs_td_error`` mean |e| and ``max_q``, the largest target."""
+        """``loss`` ½·mean(e²), ``abs_td_error`` mean |e|, ``max_q`` the largest target, ``max_abs_q`` max |Q(s, a)|."""
         errors = self.errors.double()
         return {
             "loss": float(0.5 * (errors * errors).mean()),
             "abs_td_error": float(errors.abs().mean()),
             "max_q": float(self.targets.max()),
+            "max_abs_q": float((self.targets.double() - errors).abs().max()),
         }
 
 

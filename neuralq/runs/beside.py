@@ -16,7 +16,6 @@ import inspect
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -29,8 +28,8 @@ from scipy import sparse
 from torch import Tensor
 
 from neuralq.mdp import FiniteMDP
-from neuralq.mdp.grid import GridPlan, grid_plan
-from neuralq.runs.evaluation import shown
+from neuralq.mdp.grid import grid_plan
+from neuralq.runs.held import Answer, Comparison, Held
 from neuralq.runs.stream import ObservationSpec
 from neuralq.runs.stream.vector_env import SubEnv
 from neuralq.types import Floats
@@ -38,103 +37,15 @@ from neuralq.types import Floats
 if TYPE_CHECKING:
     from neuralq.exact import Solution
 
-__all__ = ["DRAWING_NAME", "Beside", "Comparison"]
-
-DRAWING_NAME = "exact.json"
-"""What the picture of a grid is drawn from, in a run's folder."""
+__all__ = ["Beside"]
 
 _MOST_PAIRS = 200_000  # a model of more is not built unasked: that alone would take a second
 _SMALL_ROWS = 20_000  # up to here every method needs well under a second
-_MOST_FACTORED = 3_000  # states up to which a policy is evaluated by factoring a matrix
 _MOST_SECONDS = 1.0
 _NUM_STARTS = 200  # resets that tell where episodes begin, where no distribution is stated
 _ENTRIES = 4_000_000  # of one-hot vectors at a time
 _RARELY = 20.0  # a comparison may cost a twentieth of the CPU time of the run
 _ASK = "--exact true asks for it"
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What was learned beside what is true, in the environment's units.
-
-    Args:
-        q_error_max: largest |Q − Q*| over the pairs that were visited; None where none was.
-        q_error_mean: their mean.
-        q_error_max_all: the same over the legal pairs of all states in which an episode can be.
-        q_error_mean_all: their mean.
-        regret: V*(start) − V^π(start) of the greedy policy; infinite where γ = 1 and it never ends.
-        optimal_share: share of the visited states in which the greedy action is optimal.
-        optimal_share_all: of all states in which an episode can be.
-        start_value: max Q at the start, as learned.
-        exact_start_value: V* at the start.
-    """
-
-    q_error_max: float | None
-    q_error_mean: float | None
-    q_error_max_all: float
-    q_error_mean_all: float
-    regret: float
-    optimal_share: float | None
-    optimal_share_all: float
-    start_value: float
-    exact_start_value: float
-
-    def lines(self) -> list[str]:
-        """The same for people.
-
-        Example:
-            >>> print(*Comparison(0.02, 0.01, 0.5, 0.1, 0.0, 1.0, 0.875, 0.54, 0.542).lines(), sep="; ")
-            value of the start 0.540, exactly 0.542; the greedy policy earns 0 less than an optimal one; \
-optimal actions in 100% of the visited states, 88% of all; |Q − Q*| at most 0.02 (mean 0.01) \
-where it has been, 0.5 (mean 0.1) everywhere
-        """
-        lost = "never ends" if math.isinf(self.regret) else f"earns {self.regret:.3g} less than an optimal one"
-        seen = "" if self.optimal_share is None else f"{self.optimal_share:.0%} of the visited states, "
-        been = "" if self.q_error_max is None else (
-            f"at most {self.q_error_max:.3g} (mean {self.q_error_mean:.3g}) where it has been, "
-        )  # fmt: skip
-        return [
-            f"value of the start {shown(self.start_value)}, exactly {shown(self.exact_start_value)}",
-            f"the greedy policy {lost}",
-            f"optimal actions in {seen}{self.optimal_share_all:.0%} of all"
-            + ("" if self.optimal_share is not None else " states"),
-            f"|Q − Q*| {been}{self.q_error_max_all:.3g} (mean {self.q_error_mean_all:.3g}) everywhere",
-        ]
-
-    def plain(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """A solved model.
-
-    Args:
-        mdp: the model.
-        gamma: γ.
-        solution: its optimal values and actions.
-        start: where episodes begin, ``[S]``.
-        alive: states in which an episode can be and go on, ``[S]``: the others count for nothing.
-        plan: how its states lie on a grid, if they do.
-        limit: steps after which the environment cuts its episodes, which the model does not know.
-    """
-
-    mdp: FiniteMDP
-    gamma: float
-    solution: Solution
-    start: Floats
-    alive: NDArray[np.bool_]
-    plan: GridPlan | None
-    limit: int | None
-
-    def line(self) -> str:
-        how = f"{self.mdp.num_states:,} states by {self.solution.method}, {self.solution.seconds:.2g} s"
-        cut = ""
-        if self.limit is not None:
-            cut = f"; episodes are cut after {self.limit:,} steps, which the model does not know"
-        value = shown(float(self.start @ self.solution.v))
-        return f"beside what is learned stands the exact answer ({how}): V* at the start {value}{cut}"
 
 
 class Beside:
@@ -154,7 +65,7 @@ class Beside:
         self, envs: VectorEnv[Any, Any, Any], spec: ObservationSpec, gamma: float, asked: bool | None = None
     ) -> None:
         self._envs, self._spec, self._gamma, self._asked = envs, spec, gamma, asked
-        self._answer: _Answer | None = None
+        self._answer: Answer | None = None
         self._looked = False
         self._due = -math.inf
         self.visited: NDArray[np.bool_] | None = None
@@ -227,36 +138,19 @@ class Beside:
             values: encoded observations ``[N, …]`` to action values ``[N, A]``, as the learner counts.
             scale: by what its values are larger than returns.
         """
+        held = self.held(values, scale)
+        return None if held is None else held.compared()
+
+    def held(self, values: Callable[[Tensor], Tensor], scale: float) -> Held | None:
+        """Learned values of all states, held against the exact ones; None where there is no answer.
+
+        Args:
+            values: as for `compare`.
+            scale: likewise.
+        """
         self.look()
         if self._answer is None:
             return None
-        q, legal = self._learned(values, scale)
-        return _compared(self._answer, q, legal, self.visited)
-
-    def drawing(self, values: Callable[[Tensor], Tensor], scale: float) -> dict[str, Any] | None:
-        """What a picture of the grid is drawn from, as plain values; None where there is none."""
-        answer = self._answer
-        if answer is None or answer.plan is None:
-            return None
-        q, legal = self._learned(values, scale)
-        plan, solution = answer.plan, answer.solution
-        acts = answer.alive
-        legal_q = np.where(legal, q, -np.inf)
-        arrows = [plan.directions[a] if acts[s] else None for s, a in enumerate(legal_q.argmax(axis=1).tolist())]
-        chosen = solution.optimal_actions[np.arange(len(q)), legal_q.argmax(axis=1)]
-        return {
-            "num_columns": plan.num_columns,
-            "signs": ["#" if plan.walls[s] else sign.strip() for s, sign in enumerate(plan.signs)],
-            "arrows": arrows,
-            "optimal": [bool(one) if acts[s] else None for s, one in enumerate(chosen)],
-            "learned": [float(x) if acts[s] else None for s, x in enumerate(legal_q.max(axis=1))],
-            "exact": [float(x) if acts[s] else None for s, x in enumerate(solution.v)],
-            "visited": None if self.visited is None else self.visited.any(axis=1).tolist(),
-        }
-
-    def _learned(self, values: Callable[[Tensor], Tensor], scale: float) -> tuple[Floats, NDArray[np.bool_]]:
-        """Learned Q ``[S, A]`` in the environment's units, and which pairs are legal."""
-        assert self._answer is not None
         mdp = self._answer.mdp
         legal = mdp.legal & self._answer.alive[:, None]
         if self._masks is not None:
@@ -266,7 +160,7 @@ class Beside:
         few = max(1, _ENTRIES // mdp.num_states)
         with torch.no_grad():
             parts = [values(torch.from_numpy(s[at : at + few])).cpu().numpy() for at in range(0, len(s), few)]
-        return np.concatenate(parts).astype(np.float64) / scale, legal
+        return Held(self._answer, np.concatenate(parts).astype(np.float64) / scale, legal, self.visited)
 
     def state_dict(self) -> dict[str, Any] | None:
         """What was met, in bits; None where it is not watched."""
@@ -286,50 +180,6 @@ class Beside:
                 mine[:] = bits.reshape(mine.shape) != 0
 
 
-def _compared(answer: _Answer, q: Floats, legal: NDArray[np.bool_], visited: NDArray[np.bool_] | None) -> Comparison:
-    solution, start = answer.solution, answer.start
-    acts = legal.any(axis=1)
-    error = np.abs(q - solution.q)
-    met = np.zeros_like(legal) if visited is None else visited & legal
-    legal_q = np.where(legal, q, -np.inf)
-    greedy = np.where(acts, legal_q.argmax(axis=1), solution.policy)  # no episode comes where it does not act
-    optimal = solution.optimal_actions[np.arange(len(q)), greedy]
-    states = met.any(axis=1)
-    best = np.where(acts, legal_q.max(axis=1), 0.0)
-    begins = start > 0
-    v_start = float(start @ solution.v)
-    v_pi = _policy_value(answer, greedy)
-    return Comparison(
-        q_error_max=float(error[met].max()) if met.any() else None,
-        q_error_mean=float(error[met].mean()) if met.any() else None,
-        q_error_max_all=float(error[legal].max()),
-        q_error_mean_all=float(error[legal].mean()),
-        regret=max(0.0, v_start - v_pi),  # below 0 only by rounding
-        optimal_share=float(optimal[states].mean()) if states.any() else None,
-        optimal_share_all=float(optimal[acts].mean()),
-        start_value=float(start[begins] @ best[begins]),
-        exact_start_value=v_start,
-    )
-
-
-def _policy_value(answer: _Answer, policy: NDArray[np.int64]) -> float:
-    """V^π at the start; −∞ where γ = 1 and π never ends."""
-    from neuralq.exact import evaluate
-    from neuralq.exact.policies import policy_values
-    from neuralq.exact.problem import prepare
-
-    mdp = answer.mdp
-    if answer.gamma < 1 and mdp.num_states > _MOST_FACTORED:
-        acts = np.flatnonzero(~mdp.is_terminal)
-        rows = np.zeros(mdp.num_states, np.int64)
-        rows[acts] = mdp.row_index[acts, policy[acts]]
-        return float(answer.start @ policy_values(prepare(mdp, answer.gamma), rows, answer.solution.v)[0])
-    try:
-        return float(answer.start @ evaluate(mdp, policy, answer.gamma))
-    except ValueError:
-        return -math.inf
-
-
 def _with_model(envs: VectorEnv[Any, Any, Any]) -> Any:
     """What has the model: the vector environment itself, or the first of those that it steps; None where nothing has.
 
@@ -347,7 +197,7 @@ def _with_model(envs: VectorEnv[Any, Any, Any]) -> Any:
     return env if has else None
 
 
-def _solved(envs: VectorEnv[Any, Any, Any], spec: ObservationSpec, gamma: float, asked: bool) -> _Answer:
+def _solved(envs: VectorEnv[Any, Any, Any], spec: ObservationSpec, gamma: float, asked: bool) -> Answer:
     """The answer.
 
     Raises:
@@ -369,7 +219,7 @@ def _solved(envs: VectorEnv[Any, Any, Any], spec: ObservationSpec, gamma: float,
     start = _start_of(env, mdp) if single else mdp.start_distribution
     plan = grid_plan(env.unwrapped, mdp)
     limit = env.spec.max_episode_steps if single and env.spec is not None else None
-    return _Answer(mdp, gamma, solution, start, _alive(mdp, start), plan, limit)
+    return Answer(mdp, gamma, solution, start, _alive(mdp, start), plan, limit)
 
 
 def _require_states(mdp: FiniteMDP, envs: VectorEnv[Any, Any, Any], spec: ObservationSpec) -> None:

@@ -17,16 +17,18 @@ from neuralq.checks import check_whole
 from neuralq.q.flat import FlatParameters
 from neuralq.rules import Linear
 from neuralq.runs.agent import Agent
-from neuralq.runs.beside import DRAWING_NAME, Beside, Comparison
+from neuralq.runs.beside import Beside
 from neuralq.runs.evaluation import MOST_STEPS, Evaluation, evaluate_greedy, shown
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.files import plain_values, read_rows, to_json, write_durably
 from neuralq.runs.folder.origin import compared
 from neuralq.runs.folder.run_folder import RunFolder, default_run_path, read_changes, read_config
+from neuralq.runs.held import DRAWING_NAME, Comparison
 from neuralq.runs.kinds import Kind, limited_threads
 from neuralq.runs.loop import NOT_EXACT, Progress, seed_for
 from neuralq.runs.offline.playback import Playback
+from neuralq.runs.play_off import about, score_of, told_of
 from neuralq.runs.recipe.build import (
     build_q,
     build_session,
@@ -57,6 +59,8 @@ class Run:
         cpu_seconds: CPU time of training, evaluations excluded.
         wall_seconds: wall time of training and evaluation.
         greedy_return: mean return of the last greedy evaluation.
+        agent_return: mean return of the run's agent: of the play-off where there was one, else as `greedy_return`.
+        agent_standard_error: its standard error; None where no or one episode was played.
         parameters_sha256: of the flat parameter vector's bytes.
         reached: whether ``stop_at_return`` was met; None where none was asked for.
         interrupted_by: name of the signal that ended it early, or None.
@@ -66,8 +70,8 @@ class Run:
         dataset: from which recorded experience it learned; its steps are then those of the budget.
         agent: which parameters `neuralq.load` takes where nothing is said: "final" or "best".
         play_off: of a run that ended below its best evaluation, what that was decided by
-            (`neuralq.runs.evaluation.play_off`); else None.
-        exact: what its agent learned beside the exact answer (`neuralq.runs.beside.Comparison`), where there is one.
+            (`neuralq.runs.play_off`); else None.
+        exact: what its agent learned beside the exact answer (`neuralq.runs.held.Comparison`), where there is one.
         measured: what it learned that is no value of an action: of prediction the start's value and the distance from
             exact values, of R-learning the reward per step; empty for others.
         monitor: what the monitor of divergence says (`neuralq.lab.DivergenceMonitor.verdict`); None without it.
@@ -78,6 +82,8 @@ class Run:
     cpu_seconds: float
     wall_seconds: float
     greedy_return: float | None
+    agent_return: float | None
+    agent_standard_error: float | None
     parameters_sha256: str
     reached: bool | None
     interrupted_by: str | None
@@ -98,7 +104,7 @@ class Run:
     def lines(self) -> list[str]:
         """The same for people."""
         unplayed = "values of states, no policy" if "start_value" in self.measured else "not evaluated"
-        score = unplayed if self.greedy_return is None else f"greedy return {shown(self.greedy_return)}"
+        score = unplayed if self.greedy_return is None else told_of(self.plain())
         counted = "environment steps" if self.dataset is None else f"steps of the budget on {self.dataset}"
         stopped = (
             [] if self.stopped_by is None else [f"stopped by {self.stopped_by}; go on: neuralq resume {self.run_dir}"]
@@ -109,8 +115,8 @@ class Run:
             *(f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.measured.items()),
             *stopped,
         ]
-        if self.play_off is not None:
-            lines.append(_about_play_off(self.play_off))
+        if self.play_off is not None and (decided := about(self.play_off)) is not None:
+            lines.append(decided)
         if self.exact is not None:
             lines += Comparison(**self.exact).lines()
         if self.monitor is not None and self.monitor["alarms"]:
@@ -121,6 +127,8 @@ class Run:
 def _result(config: RunConfig, session: Session, progress: Progress, folder: RunFolder) -> Run:
     play_off = progress.agent
     agent = "final" if play_off is None else str(play_off["agent"])
+    told = {"greedy_return": progress.greedy_return, "agent_standard_error": _last_error(folder.metrics_path)}
+    score = score_of({**told, "play_off": play_off})
     exact = _beside_exact(session, folder, agent)
     return Run(
         run_dir=folder.named,
@@ -128,6 +136,8 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
         cpu_seconds=progress.cpu_seconds,
         wall_seconds=progress.wall_seconds,
         greedy_return=progress.greedy_return,
+        agent_return=None if score is None else score.mean,
+        agent_standard_error=None if score is None else score.standard_error,
         parameters_sha256=session.learner.engine.flat.sha256(),
         reached=None if config.stop_at_return is None else progress.reached_at is not None,
         interrupted_by=progress.interrupted_by,
@@ -143,18 +153,10 @@ def _result(config: RunConfig, session: Session, progress: Progress, folder: Run
     )
 
 
-def _about_play_off(found: Mapping[str, Any]) -> str:
-    best, final = shown(found["best_return"]), shown(found["final_return"])
-    which = (
-        "the best are the run's agent, --final takes the last"
-        if found["agent"] == "best"
-        else "the last are the run's agent, for the best are not better beyond chance; --best takes them"
-    )
-    return (
-        f"it ended below its best evaluation, at {found['best_env_steps']:,} steps; over {found['num_episodes']} fresh "
-        f"episodes the last parameters score {final}, the best {best}, ± {found['standard_error']:.2g} between them: "
-        f"{which}"
-    )
+def _last_error(metrics: Path) -> float | None:
+    """Standard error of the last evaluation, by its row."""
+    listed = [row.get("returns") for row in read_rows(metrics) if row.get("kind") == "evaluation"]
+    return Evaluation(tuple(listed[-1]), (), 0).standard_error if listed and listed[-1] else None
 
 
 def _beside_exact(session: Session, folder: RunFolder, agent: str) -> dict[str, Any] | None:
@@ -163,13 +165,14 @@ def _beside_exact(session: Session, folder: RunFolder, agent: str) -> dict[str, 
     if beside is None:
         return None
     with session.playing_with(load_best(folder.path) if agent == "best" else None):
-        values = session.learner.engine.all, session.value_scale
-        found, drawing = beside.compare(*values), beside.drawing(*values)
-    if drawing is not None:
+        held = beside.held(session.learner.engine.all, session.value_scale)
+    if held is None:
+        return None
+    if (drawing := held.drawing()) is not None:
         write_durably(
             folder.path / DRAWING_NAME, to_json(plain_values(drawing, DRAWING_NAME), DRAWING_NAME, sealed=True)
         )
-    return None if found is None else found.plain()
+    return held.compared().plain()
 
 
 def agent_of(run_dir: str | Path) -> str:

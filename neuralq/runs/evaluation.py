@@ -18,9 +18,9 @@ from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.acting import choose_greedy
 
 if TYPE_CHECKING:
-    from neuralq.runs.beside import Comparison
+    from neuralq.runs.held import Comparison
 
-__all__ = ["MOST_STEPS", "Evaluation", "evaluate_greedy", "play_off", "shown"]
+__all__ = ["MOST_STEPS", "Evaluation", "evaluate_greedy", "shown"]
 
 MOST_STEPS = 10_000
 """After so many an episode is cut where nothing else is said."""
@@ -133,54 +133,3 @@ def evaluate_greedy(
             returns.append(value)
             lengths.append(length)
     return Evaluation(tuple(returns), tuple(lengths), num_cut)
-
-
-Play = Callable[[int, int], Evaluation]
-
-
-def play_off(final: Play, best: Play, per_round: int, most_steps: int, seed: int) -> dict[str, Any]:
-    """Which of two agents a run is to keep: the final one, unless the best one is better beyond chance.
-
-    Both play the same episodes. The best is kept where the mean of its returns less the final one's exceeds the
-    standard error of that difference: one evaluation that was lucky is no reason.
-
-    Args:
-        final: plays so many episodes from a seed on with the last parameters.
-        best: the same with those whose evaluation scored highest.
-        per_round: episodes that are played at a time.
-        most_steps: of both together; a round that was begun is finished, and the first is played in any case.
-        seed: of the episodes.
-
-    Returns:
-        "agent", which is "final" or "best", "final_return", "best_return", "num_episodes", "difference" and its
-        "standard_error".
-
-    Example:
-        >>> steady = lambda n, seed: Evaluation((500.0,) * n, (500,) * n, 0)
-        >>> falls = lambda n, seed: Evaluation((500.0, 151.0) * (n // 2), (500, 151) * (n // 2), 0)
-        >>> play_off(falls, steady, 20, 10**6, 0)["agent"], play_off(steady, falls, 20, 10**6, 0)["agent"]
-        ('best', 'final')
-    """
-    returns: tuple[list[float], list[float]] = ([], [])
-    num_steps = 0
-    while len(returns[0]) < _MOST_EPISODES and (not returns[0] or num_steps < most_steps):
-        count = min(per_round, max(2, _MOST_EPISODES - len(returns[0])))
-        at = seed + len(returns[0])
-        for play, kept in zip((final, best), returns, strict=True):
-            found = play(count, at)
-            kept += found.returns
-            num_steps += sum(found.lengths)
-    gain = np.subtract(returns[1], returns[0])
-    difference, error = float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(len(gain)))
-    return {
-        "agent": "best" if difference > error else "final",
-        "final_return": float(np.mean(returns[0])),
-        "best_return": float(np.mean(returns[1])),
-        "num_episodes": len(gain),
-        "difference": difference,
-        "standard_error": error,
-    }
-
-
-_MOST_EPISODES = 100
-"""Of a play-off."""

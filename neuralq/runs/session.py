@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,13 +18,14 @@ from neuralq.learners.averaging import evaluating_with, evaluation_parameters
 from neuralq.learners.learner import Learner, Update
 from neuralq.runs.agent import Agent
 from neuralq.runs.beside import Beside
-from neuralq.runs.evaluation import Evaluation, evaluate_greedy, play_off
+from neuralq.runs.evaluation import Evaluation, evaluate_greedy
 from neuralq.runs.folder.best import Best
 from neuralq.runs.folder.env_encode import NotCopyable, encode_env
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.folder.env_restore import restore_env
 from neuralq.runs.loop import Diverged, seed_for
 from neuralq.runs.offline.playback import Playback
+from neuralq.runs.play_off import play_off
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream import Episode, Interaction, Policy, Step
 from neuralq.runs.stream.early_returns import EarlyReturns
@@ -116,8 +118,10 @@ class Session:
 
     @property
     def observed(self) -> tuple[Learner, Sample] | None:
-        """The learner and the sample it last learned from."""
-        return None if self._last is None else (self.learner, self._last[1])
+        """The learner and the sample it last learned from, which says how its rewards are normalised by now."""
+        if self._last is None:
+            return None
+        return self.learner, dataclasses.replace(self._last[1], reward_scale=self.value_scale / self.reward_scale)
 
     def advance(self, until: int, request: StopRequest) -> None:
         """One step or more; a rollout that was begun is finished: half of one can be neither learned from nor saved."""
@@ -245,7 +249,7 @@ class Session:
                 seen.load_state_dict(statistics)
 
     def play_off(self, best: Best, seed: int) -> dict[str, Any]:
-        """The last and the best parameters on the same fresh episodes; the rule is `neuralq.runs.evaluation.play_off`.
+        """The last and the best parameters on the same fresh episodes; the rule is `neuralq.runs.play_off.play_off`.
 
         There are up to 100 episodes, and together no more than half the steps of training, in rounds as long as an
         evaluation; one round there is in any case.

@@ -24,11 +24,11 @@ _HEADINGS = ("run", "seeds", "greedy return", "95 % interval", "mean", "steps", 
 
 
 def compare(argv: list[str]) -> int:
-    """Compare the final greedy returns of runs, grouped over their seeds."""
+    """Compare the greedy returns of the agents of runs, grouped over their seeds."""
     parser = command_parser(
         "compare",
-        "Compare runs and sweeps. Runs that differ in their seed alone are one row: the interquartile mean of their "
-        "last greedy returns and its 95 % interval (stratified bootstrap, Agarwal et al. 2021).",
+        "Compare runs and sweeps. Runs that differ in their seed alone are one row: the interquartile mean of what "
+        "their agents score and its 95 % interval (stratified bootstrap, Agarwal et al. 2021).",
         "neuralq compare runs/* --out curves.svg",
         "neuralq compare SWEEP-A SWEEP-B --json",
     )

@@ -50,7 +50,7 @@ def demo(argv: list[str]) -> int:
         "environment": "CartPole-v1",
         "environment steps": run.env_steps,
         "CPU-seconds of training": round(run.cpu_seconds, 2),
-        "greedy return": run.greedy_return,
+        "greedy return": run.agent_return,
         "target": TARGET,
     }
     path = write_demo_report(folder / "report.html", read_metrics(run.run_dir), facts, results, target=TARGET)
@@ -74,7 +74,7 @@ def _cartpole(path: Path, seed: int, console: Console) -> Run:
     with training_bar(CONTROL, config) as bar:
         run = train(config, path, [bar])
     console.print(
-        f"   greedy return {shown(run.greedy_return or 0.0)} over 20 episodes after {run.env_steps:,} steps: "
+        f"   greedy return {shown(run.agent_return or 0.0)} over 20 episodes after {run.env_steps:,} steps: "
         f"{run.cpu_seconds:.2f} CPU-seconds of training, {run.wall_seconds:.1f} s with evaluation",
         highlight=False,
         soft_wrap=True,

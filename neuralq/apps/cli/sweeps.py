@@ -24,6 +24,7 @@ from neuralq.runs.folder.origin import flat_names
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
+from neuralq.runs.play_off import told_of
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.sweep import (
     Status,
@@ -198,9 +199,9 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
     lines = []
     for run in result.runs:
         if run.state == "finished":
-            value, seconds = run.summary.get("greedy_return"), run.summary.get("cpu_seconds") or 0.0
-            score = "not evaluated" if value is None else f"greedy return {shown(value)}"
-            lines.append(f"seed {run.seed}: {score}, {run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds")
+            seconds = run.summary.get("cpu_seconds") or 0.0
+            spent = f"{run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds"
+            lines.append(f"seed {run.seed}: {told_of(run.summary)}, {spent}")
         else:
             log = f" (see {sweep.log_path(run.seed)})" if run.reason else ""
             lines.append(f"seed {run.seed}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")

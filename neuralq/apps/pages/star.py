@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuralq.figures import COLOURS, MARKERS, draw_svg, steps_axis, tame
+from neuralq.runs.folder.files import as_float
 from neuralq.runs.report.curves import learning_curve_svg
 from neuralq.runs.report.page import Page, facts_table, format_number, html_table
-from neuralq.runs.report.readings import Row, as_float
+from neuralq.runs.report.readings import Row
 from neuralq.types import Array
 
 if TYPE_CHECKING:

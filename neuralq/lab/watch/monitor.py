@@ -8,6 +8,9 @@ Three signs, from the surest to the earliest:
   Local
   and only a warning: what stabilises the run may be what the kernel leaves out. It must say so several times in a row.
 
+All is said in the environment's units. What rewards and values say repeats from run to run; kernels come when the clock
+affords them, and need not.
+
 The monitor reads and never writes: it draws from a generator of its own, works on copies, and a run ends with the same
 bits with and without it. It watches every training unasked (`DivergenceMonitor.sparing`), and then spends at most a
 fiftieth of the run's CPU time: what it would cost more is left out until the run has gone on long enough.
@@ -26,7 +29,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from neuralq.checks import check_positive, check_whole
 from neuralq.lab.watch.advice import RunTraits, advise
@@ -96,7 +99,7 @@ class DivergenceMonitor:
         >>> monitor = DivergenceMonitor(RunTraits(gamma=0.9, step_size=0.1), largest_reward=1.0)
         >>> with warnings.catch_warnings(record=True) as caught:
         ...     warnings.simplefilter("always")
-        ...     monitor({"kind": "train", "env_steps": 64, "max_q": 50.0})
+        ...     monitor({"kind": "train", "env_steps": 64, "max_abs_q": 50.0})
         >>> monitor.alarms[0].kind, len(caught)
         ('soft divergence', 1)
     """
@@ -134,7 +137,6 @@ class DivergenceMonitor:
         self._resumed = False
         self._looks = self._next_kernel = self._kernels = self._env_steps = 0
         self._seen_bound = self._largest_value = self._run_seconds = 0.0
-        self._value_now: float | None = None
         self._since_seconds: float | None = None
         self._look_seconds, self._kernel_seconds = _FIRST_LOOK_SECONDS, _FIRST_KERNEL_SECONDS
         self.cpu_seconds = 0.0
@@ -164,19 +166,21 @@ class DivergenceMonitor:
 
     @property
     def bound(self) -> float | None:
-        """r_max / (1 − γ), in the learner's units; None without a reward or without discounting."""
+        """r_max / (1 − γ), in the environment's units; None without a reward or without discounting."""
         if self.traits.gamma == 1:
             return None
         if self._given is not None:
-            return self._given * self.traits.reward_scale / (1 - self.traits.gamma)
+            return self._given / (1 - self.traits.gamma)
         return self._seen_bound or None
 
     def observe(self, learner: Learner, sample: Sample) -> None:
         """Read the learner's Q-function on what it last learned from; called by `neuralq.train` before each row."""
-        if not self._affords(self._look_seconds):
-            self._value_now = None
-            return
         began, kernels = time.process_time(), self._kernels
+        self._note_rewards(sample)
+        self.cpu_seconds += time.process_time() - began
+        if not self._affords(self._look_seconds):
+            return
+        began = time.process_time()
         self._observe(learner, sample)
         spent = time.process_time() - began
         self.cpu_seconds += spent
@@ -193,7 +197,6 @@ class DivergenceMonitor:
         rows = _held_rows(sample)
         if not len(rows.a_tm1):
             return
-        self._note_rewards(rows)
         few = self._rng.permutation(len(rows.a_tm1))[: self._num_samples]
         rows = rows.map(lambda x: x[torch.from_numpy(few).to(x.device)].cpu())
         if self._recent is not None:
@@ -205,7 +208,6 @@ class DivergenceMonitor:
             )
         self._recent = rows
         q = learner.engine.q
-        self._value_now = _largest_value(q, rows)
         due = self._every and self._looks >= self._next_kernel and len(rows.a_tm1) >= min(self._num_samples, 8)
         if due and self._affords(self._kernel_seconds):
             self._latest = self._try_inspect(q, rows)
@@ -251,11 +253,8 @@ class DivergenceMonitor:
             self._measure(row)
 
     def _measure(self, row: Mapping[str, Any]) -> None:
-        scale = self.traits.reward_scale  # rows are in the environment's units, the rest here in the learner's
-        told = {name: _absolute(row.get(name)) for name in ("abs_td_error", "max_q")}
-        error, value = (None if x is None else scale * x for x in told.values())
-        measured = {"abs_td_error": error, "largest_value": value if self._value_now is None else self._value_now}
-        known = {name: x for name, x in measured.items() if x is not None}
+        columns = {"abs_td_error": "abs_td_error", "largest_value": "max_abs_q"}
+        known = {name: abs(float(row[column])) for name, column in columns.items() if row.get(column) is not None}
         for name, x in known.items():
             if not math.isfinite(x):
                 self._raise("not finite", f"{_MEASURES[name]} is no longer a finite number.")
@@ -342,14 +341,15 @@ class DivergenceMonitor:
             self.unavailable = str(error).strip().split("\n")[0]
             return None
 
-    def _note_rewards(self, rows: Transition) -> None:
-        gamma = self.traits.gamma
-        if gamma == 1:
+    def _note_rewards(self, sample: Sample) -> None:
+        gamma, most, scale = self.traits.gamma, self._seen_bound * (1 - self.traits.gamma), sample.reward_scale
+        if gamma == 1 or not float(sample.transition.r_t.abs().max()) / scale > most:  # most of the time, and cheap
             return
-        size = rows.r_t.double().abs() * self.traits.reward_scale
+        rows = _held_rows(sample)
         # A row of n steps is discounted by γⁿ: |Σ γᵏ r| / (1 − γⁿ) ≤ r_max / (1 − γ).
         share = torch.where(rows.discount_t > 0, 1 - rows.discount_t.double(), 1 - gamma)
-        self._seen_bound = max(self._seen_bound, float((size / share.clamp(min=1 - gamma)).max()))
+        sizes = rows.r_t.double().abs() / scale / share.clamp(min=1 - gamma)
+        self._seen_bound = max(self._seen_bound, float(sizes.max()) if len(sizes) else 0.0)
 
     def columns(self) -> dict[str, Any]:
         """What rows of metrics are to say: the alarms so far, by kind, or None."""
@@ -384,8 +384,8 @@ class DivergenceMonitor:
             "alarms": [alarm.kind for alarm in self.alarms],
             "seen": self.explain(),
             "advice": list(self.alarms[-1].advice) if self.alarms else [],
-            "largest_value": self._largest_value / self.traits.reward_scale,
-            "bound": None if self.bound is None else self.bound / self.traits.reward_scale,
+            "largest_value": self._largest_value,
+            "bound": self.bound,
             "cpu_seconds": self.cpu_seconds,
         }
 
@@ -407,18 +407,18 @@ class DivergenceMonitor:
         parts = [f"{self._env_steps:,} steps watched: " + ("no alarm." if not self.alarms else "")]
         parts += [f"[{alarm.kind}, at {alarm.env_steps:,} steps] {alarm.message}" for alarm in self.alarms]
         if not self.alarms and self.bound is not None:
-            parts.append(f"The largest |Q| was {self._largest_value:.4g} of at most {self.bound:.4g}.")
+            parts.append(
+                f"The largest |Q(s, a)| of the updates looked at, one before each row of metrics, was "
+                f"{self._largest_value:.4g}; by the rewards of the same steps no return exceeds {self.bound:.4g}."
+            )
         if self.diagnoses and not any(alarm.kind == "kernel" for alarm in self.alarms):
             parts.append(self.diagnoses[-1][1].explain())
+            parts += [] if self._share is None else ["When that is computed depends on the clock."]
         if self.unavailable is not None:
             parts.append(f"The kernel could not be computed: {self.unavailable}.")
         if self.alarms:
             parts.append(f"What may help: {'; '.join(self.alarms[-1].advice)}.")
         return " ".join(part.strip() for part in parts)
-
-
-def _absolute(value: Any) -> float | None:
-    return None if value is None else abs(float(value))
 
 
 def _held_rows(sample: Sample) -> Transition:
@@ -428,11 +428,3 @@ def _held_rows(sample: Sample) -> Transition:
     if sample.weight is None or sample.indices is not None:
         return flat
     return flat.map(lambda x: x[sample.weight.reshape(-1).to(x.device) > 0])
-
-
-def _largest_value(q: QFunction, rows: Transition) -> float:
-    device = next(cast(nn.Module, q).parameters()).device
-    with torch.no_grad():
-        values: Tensor = q.all(rows.s_tm1.to(device)).double().abs()
-    legal = values[~torch.isposinf(values)] if bool(torch.isinf(values).any()) else values
-    return float(legal.max()) if legal.numel() else 0.0

@@ -31,6 +31,7 @@ __all__ = [
     "RunFolderBusy",
     "RunFolderError",
     "append_line",
+    "as_float",
     "clear_left_overs",
     "open_regular",
     "parse_json",
@@ -372,3 +373,13 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         sealed_before = sealed
         rows.append(row)
     return rows
+
+
+def as_float(value: Any) -> float:
+    """The number that ``value`` is; NaN when it is none (null, text, a flag), ±inf beyond float64."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf  # type: ignore[operator]

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuralq.figures import COLOURS, MARKERS, draw_png, draw_svg, steps_axis, tame
+from neuralq.runs.folder.files import as_float
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_config, read_metrics, read_seed
+from neuralq.runs.play_off import Score, score_of
 from neuralq.runs.report.page import flatten
-from neuralq.runs.report.readings import as_float, finite_series
+from neuralq.runs.report.readings import finite_series, read_present_summary
 from neuralq.runs.sweep import is_sweep_folder, open_sweep
 from neuralq.runs.sweep.statistics import Estimate, bootstrap_interval, estimate, interquartile_mean
 from neuralq.types import Floats
@@ -30,12 +32,13 @@ _CURVE_RESAMPLES = 1_000
 
 @dataclass(frozen=True)
 class SeedRun:
-    """One run: its folder, seed, greedy evaluations and costs; ``steps`` and ``returns`` are ``[E]``."""
+    """One run: its folder, seed, greedy evaluations ``[E]``, what its agent scores, and costs."""
 
     path: Path
     seed: int
     steps: Floats
     returns: Floats
+    score: Score
     env_steps: int
     cpu_seconds: float
 
@@ -58,8 +61,8 @@ class Group:
 
     @property
     def returns(self) -> list[float]:
-        """Final greedy return of each run."""
-        return [float(run.returns[-1]) for run in self.runs]
+        """Greedy return of each run's agent."""
+        return [run.score.mean for run in self.runs]
 
     @property
     def estimate(self) -> Estimate:
@@ -78,7 +81,8 @@ class Group:
             "high": found.high,
             "mean": float(np.mean(self.returns)),
             "seeds": [run.seed for run in self.runs],
-            "greedy_returns": self.returns,
+            "agent_returns": self.returns,
+            "greedy_returns": [float(run.returns[-1]) for run in self.runs],
             "env_steps": [run.env_steps for run in self.runs],
             "cpu_seconds": [run.cpu_seconds for run in self.runs],
             "run_dirs": [str(run.path) for run in self.runs],
@@ -164,7 +168,9 @@ def _read_run(path: Path) -> SeedRun | None:
     if not len(steps):
         return None
     cpu = max((as_float(row.get("cpu_seconds")) for row in rows), default=0.0)
-    return SeedRun(path, read_seed(path), steps, returns, max(int(row["env_steps"]) for row in rows), cpu)
+    score = score_of({**read_present_summary(path, rows), "greedy_return": float(returns[-1])})
+    assert score is not None, "there is an evaluation"
+    return SeedRun(path, read_seed(path), steps, returns, score, max(int(row["env_steps"]) for row in rows), cpu)
 
 
 def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -204,7 +210,7 @@ def comparison_svg(groups: Sequence[Group]) -> str:
         MissingExtra: matplotlib is not installed.
     """
     ends = "; ".join(f"{group.label}: {group.estimate.iqm:.4g}" for group in groups)
-    text = f"Final greedy return, interquartile mean over seeds. {ends}."
+    text = f"Greedy return of the agent of each run, interquartile mean over seeds. {ends}."
     return draw_svg("comparison", "Learning curves", text, _SIZE, lambda figure: _paint(figure, groups))
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from neuralq.figures import COLOURS, draw_svg, scale_axis, steps_axis, tame
-from neuralq.runs.report.readings import Row, as_float, finite_series, quartiles, standard_errors, thin
+from neuralq.runs.folder.files import as_float
+from neuralq.runs.report.readings import Row, finite_series, quartiles, standard_errors, thin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

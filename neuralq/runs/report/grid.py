@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuralq.figures import draw_svg
-from neuralq.runs.report.readings import as_float
+from neuralq.figures import at_least, draw_svg
+from neuralq.runs.folder.files import as_float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,15 +19,18 @@ __all__ = ["grid_svg"]
 
 _ARROWS = "↑→↓←"
 _MOST_CELLS = 400
-_COLUMNS = ("signs", "arrows", "optimal", "learned", "exact", "visited")
+_COLUMNS = ("signs", "arrows", "optimal", "learned", "error")
+_PIXELS = 46
+"""Of a cell, at least: a wide map scrolls where there is less room."""
 
 
-def grid_svg(drawing: Mapping[str, Any], *, name: str = "grid") -> str | None:
-    """Two maps: values with the greedy action of each cell, and |V − V*|; None where there is nothing to draw.
+def grid_svg(drawing: Mapping[str, Any], *, name: str = "grid") -> tuple[str, str] | None:
+    """Two maps, values with the greedy action of each cell and errors, and what they show; None without a grid.
 
     Args:
         drawing: columns of one entry per cell, row by row from the top left: "signs", "arrows" (0 to 3, clockwise from
-            up), "optimal" (whether that action is), "learned" and "exact" values, "visited"; and "num_columns".
+            up), "optimal" (whether that action is), "learned" values, the "error" (largest |Q − Q*| over the actions)
+            and "visited", which may be None; and "num_columns".
         name: prefix of the ids in the SVG.
 
     Raises:
@@ -37,33 +40,40 @@ def grid_svg(drawing: Mapping[str, Any], *, name: str = "grid") -> str | None:
     columns = [drawing.get(key) for key in _COLUMNS]
     if not isinstance(width, int) or width < 1 or not all(isinstance(column, list) for column in columns):
         return None
-    signs, arrows, optimal, learned, exact, visited = columns
+    signs, arrows, optimal, learned, wrong = columns
     count = len(signs)  # type: ignore[arg-type]
-    if not 0 < count <= _MOST_CELLS or count % width or any(len(column) != count for column in columns):  # type: ignore[arg-type]
+    known = drawing.get("visited")
+    visited = known if isinstance(known, list) else [True] * count
+    if not 0 < count <= _MOST_CELLS or count % width or any(len(one) != count for one in (*columns, visited)):  # type: ignore[arg-type]
         return None
-    v, right = (np.array([as_float(x) for x in column]).reshape(-1, width) for column in (learned, exact))  # type: ignore[union-attr]
+    v, error = (np.array([as_float(x) for x in column]).reshape(-1, width) for column in (learned, wrong))  # type: ignore[union-attr]
     height = len(v)
-    error = np.abs(v - right)
 
     def paint(figure: Figure) -> None:
-        panels = figure.subplots(1, 2) if width <= 8 else figure.subplots(2, 1)
-        _paint_map(panels[0], v, "value and greedy action", "cividis", below=0.34)
-        _paint_map(panels[1], error, "|V − V*|", "Oranges", below=0.0)
+        panels = figure.subplots(1, 2) if width <= 6 else figure.subplots(2, 1)
+        _paint_map(panels[0], v, "value and greedy action", "cividis", below=0.3)
+        _paint_map(panels[1], error, "largest |Q − Q*| of the actions", "Oranges", below=0.0)
         cells = zip(signs, arrows, optimal, visited, v.ravel(), strict=True)  # type: ignore[arg-type]
         for i, (sign, arrow, right_way, seen, value) in enumerate(cells):
             y, x = divmod(i, width)
             if isinstance(arrow, int) and 0 <= arrow < 4 and math.isfinite(value):
                 ink = {"color": _ink(value, v), "alpha": 1.0 if seen else 0.5}
-                panels[0].text(x, y - 0.12, _ARROWS[arrow], ha="center", va="center", fontsize=14, **ink)
+                panels[0].text(x, y - 0.14, _ARROWS[arrow], ha="center", va="center", fontsize=14, **ink)
                 if not right_way:
-                    panels[0].plot(x, y - 0.12, marker="s", ms=15, mfc="none", mec="#d55e00", mew=2)
+                    panels[0].plot(x, y - 0.14, marker="s", ms=15, mfc="none", mec="#d55e00", mew=2)
             elif isinstance(sign, str):
                 for axes in panels:
                     axes.text(x, y, sign[:2], ha="center", va="center", color="#888888")
 
-    size = (6.0, 0.5 + 2.9 * height / width) if width <= 8 else (6.0, 0.9 + 2 * 5.8 * height / width)
+    size = (6.4, 0.5 + 3.0 * height / width) if width <= 6 else (6.4, 1.0 + 2 * 6.2 * height / width)
     worst = f"{np.nanmax(error):.3g}" if np.isfinite(error).any() else "unknown"
-    return draw_svg(name, "Map of the grid", f"Values and greedy actions, and errors up to {worst}.", size, paint)
+    svg = draw_svg(name, "Map of the grid", f"Values and greedy actions, and errors up to {worst}.", size, paint)
+    pale = ", pale in states that were never visited" if isinstance(known, list) else ""
+    words = (
+        f"Arrows are greedy actions{pale}; a frame marks one that is not optimal. On the right, or below, the error of "
+        "each state: the largest |Q − Q*| over its actions."
+    )
+    return at_least(svg, _PIXELS * (2 * width if width <= 6 else width)), words
 
 
 def _paint_map(axes: Axes, values: Any, title: str, shades: str, below: float) -> None:
@@ -82,7 +92,7 @@ def _paint_map(axes: Axes, values: Any, title: str, shades: str, below: float) -
         return
     for (y, x), value in np.ndenumerate(shown.filled(np.nan)):
         if math.isfinite(value):
-            size = 8 if width <= 8 else 7
+            size = 8
             axes.text(
                 x,
                 y + below,

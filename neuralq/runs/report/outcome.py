@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from neuralq.runs.folder.files import as_float
+from neuralq.runs.held import Comparison
+from neuralq.runs.play_off import about, score_of
 from neuralq.runs.report.page import html_table, short_number
-from neuralq.runs.report.readings import Row, as_float, finite_series, rows_by_step
+from neuralq.runs.report.readings import Row, finite_series, rows_by_step
 
-__all__ = ["exact_table", "network_table", "play_off_words", "tiles_of", "watched_words"]
+__all__ = ["exact_table", "kept_words", "network_table", "play_off_words", "tiles_of", "watched_words"]
 
 Tile = tuple[str, str, str]
 
@@ -27,7 +31,7 @@ def tiles_of(rows: Sequence[Row], summary: Mapping[str, Any], target: float | No
         >>> tiles_of(rows, {}, None)[0]
         ('return per episode', '2 ± 1', 'greedy policy, 2 episodes at 64 steps, standard error')
     """
-    found = [*_returns(rows), *_budget(rows, summary, target)]
+    found = [*_returns(rows, summary), *_budget(rows, summary, target)]
     exact = summary.get("exact")
     if isinstance(exact, Mapping) and math.isfinite(start := as_float(exact.get("start_value"))):
         right = as_float(exact.get("exact_start_value"))
@@ -39,21 +43,40 @@ def tiles_of(rows: Sequence[Row], summary: Mapping[str, Any], target: float | No
     return found
 
 
-def _returns(rows: Sequence[Row]) -> list[Tile]:
+def kept_words(summary: Mapping[str, Any]) -> tuple[str, str] | None:
+    """What the agent that a play-off chose scores, and which it is; None without a play-off.
+
+    Example:
+        >>> off = {"agent": "best", "best_return": 9.0, "best_standard_error": 0.25, "num_episodes": 100}
+        >>> kept_words({"greedy_return": 0.5, "play_off": off})
+        ('9 ± 0.25', 'the best parameters, 100 fresh episodes, standard error')
+    """
+    score = score_of(summary)
+    if score is None or score.num_episodes is None:
+        return None
+    which = f"the {'best' if score.agent == 'best' else 'last'} parameters, {score.num_episodes:,} fresh episodes"
+    if score.standard_error is None:
+        return short_number(score.mean), which
+    return f"{short_number(score.mean)} ± {short_number(score.standard_error, 2)}", f"{which}, standard error"
+
+
+def _returns(rows: Sequence[Row], summary: Mapping[str, Any]) -> list[Tile]:
+    kept = kept_words(summary)
+    found = [] if kept is None else [("return of the agent", *kept)]
     steps, returns = finite_series(rows, "evaluation", "greedy_return")
     if not len(steps):
-        return []
+        return found
     at, row = rows_by_step(rows, "evaluation")[-1]
     listed = row.get("returns")
     each = np.array([as_float(one) for one in listed] if isinstance(listed, list) else [])
-    last = as_float(row.get("greedy_return"))
-    value, remark = short_number(last), f"greedy policy, at {at:,.0f} steps"
+    value, remark = short_number(as_float(row.get("greedy_return"))), f"greedy policy, at {at:,.0f} steps"
     if len(each) > 1 and np.isfinite(each).all() and np.abs(each).max() < 1e150:
         value += f" ± {short_number(float(each.std(ddof=1)) / math.sqrt(len(each)), 2)}"
         remark = f"greedy policy, {len(each)} episodes at {at:,.0f} steps, standard error"
     best = int(returns.argmax())
     return [
-        ("return per episode", value, remark),
+        *found,
+        ("return per episode" if kept is None else "last evaluation", value, remark),
         ("best evaluation", short_number(returns[best]), f"at {steps[best]:,.0f} steps"),
     ]
 
@@ -85,22 +108,18 @@ def _budget(rows: Sequence[Row], summary: Mapping[str, Any], target: float | Non
 def play_off_words(summary: Mapping[str, Any]) -> str | None:
     """What decided between the last and the best parameters, of a run that ended below its best evaluation."""
     found = summary.get("play_off")
-    if not isinstance(found, Mapping):
-        return None
-    numbers = {
-        name: as_float(found.get(name)) for name in ("best_return", "final_return", "num_episodes", "standard_error")
-    }
-    if not all(map(math.isfinite, numbers.values())):
-        return None
-    which = (
-        "the best are" if found.get("agent") == "best" else "the last are, for the best are not better beyond chance,"
-    )
-    return (
-        f"The run ended below its best evaluation. Over {numbers['num_episodes']:,.0f} fresh episodes the last "
-        f"parameters score {short_number(numbers['final_return'])} and the best "
-        f"{short_number(numbers['best_return'])}, with a standard error of "
-        f"{short_number(numbers['standard_error'], 2)} of the difference: {which} the run's agent."
-    )
+    text = about(found) if isinstance(found, Mapping) else None
+    return None if text is None else sentence(text)
+
+
+def sentence(text: str) -> str:
+    """A line of the terminal as a sentence of a page.
+
+    Example:
+        >>> sentence("it ended; so be it")
+        'It ended; so be it.'
+    """
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 _EXACT = (
@@ -115,14 +134,8 @@ def exact_table(summary: Mapping[str, Any]) -> tuple[str, str] | None:
     found = summary.get("exact")
     if not isinstance(found, Mapping):
         return None
-    regret = as_float(found.get("regret"))
-    lost = (
-        "never ends" if regret == math.inf else f"earns {short_number(regret)} less than an optimal one from the start"
-    )
-    text = (
-        f"The start is worth {short_number(as_float(found.get('start_value')))} by what was learned, and "
-        f"{short_number(as_float(found.get('exact_start_value')))} exactly. The greedy policy {lost}."
-    )
+    numbers = {one.name: as_float(found.get(one.name)) for one in fields(Comparison)}
+    text = sentence("; ".join(Comparison(**numbers).lines()[:2]))
     body = [[name, *(_share(name, as_float(found.get(key))) for key in keys)] for name, *keys in _EXACT]
     return text, html_table("Learned beside exact", ("", "states it has visited", "all states"), body)
 

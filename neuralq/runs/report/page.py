@@ -92,7 +92,9 @@ class Page:
 
     def figure(self, svg: str, caption: str) -> None:
         """An SVG element with a caption."""
-        self._body.append(f"<figure>\n{svg}\n<figcaption>{escape(caption)}</figcaption>\n</figure>")
+        self._body.append(
+            f'<figure>\n<div class="scroll">{svg}</div>\n<figcaption>{escape(caption)}</figcaption>\n</figure>'
+        )
 
     def table(self, table: str) -> None:
         """A table made by `html_table` or `facts_table`."""

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from neuralq.runs.folder.files import as_float, read_json
 from neuralq.types import Floats
 
-__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "standard_errors", "thin"]
+__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "read_present_summary", "standard_errors", "thin"]
 
 Row = Mapping[str, Any]
 
 
-def as_float(value: Any) -> float:
-    """The number that ``value`` is; NaN when it is none (null, text, a flag), ±inf beyond float64."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
+def read_present_summary(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:
+    """``summary.json``; empty where there is none, or where the run has gone on since it was written.
+
+    Raises:
+        RunFolderError: it is damaged.
+    """
+    file = folder / "summary.json"
+    summary = read_json(file) if file.exists() else {}
+    at = as_float(summary.get("env_steps"))
+    return {} if any(as_float(row.get("env_steps")) > at for row in rows) else summary
 
 
 def rows_by_step(rows: Iterable[Row], kind: str) -> list[tuple[float, Row]]:

@@ -8,15 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuralq.runs.beside import DRAWING_NAME
 from neuralq.runs.folder import checkpoint
-from neuralq.runs.folder.files import read_json, read_rows
+from neuralq.runs.folder.files import as_float, read_json, read_rows
 from neuralq.runs.folder.run_folder import warn_of_lost_rows
+from neuralq.runs.held import DRAWING_NAME
 from neuralq.runs.report.curves import SIGNALS, curve_words, learning_curve_svg, signals_svg
 from neuralq.runs.report.grid import grid_svg
-from neuralq.runs.report.outcome import exact_table, network_table, play_off_words, tiles_of, watched_words
+from neuralq.runs.report.outcome import exact_table, kept_words, network_table, play_off_words, tiles_of, watched_words
 from neuralq.runs.report.page import Page, facts_table, flatten, tiles
-from neuralq.runs.report.readings import Row, as_float, finite_series, first_not_finite
+from neuralq.runs.report.readings import Row, finite_series, first_not_finite, read_present_summary
 
 __all__ = ["write_report"]
 
@@ -46,11 +46,12 @@ def write_report(run_dir: str | Path) -> Path:
     if not any((folder / file).exists() for file in _FILES):
         raise FileNotFoundError(f"{folder} is no run folder: it holds none of {', '.join(_FILES)}; pass one that does")
     rows = read_rows(folder / "metrics.jsonl")
-    files = (folder / f"{name}.json" for name in ("config", "versions", "summary"))
-    config, versions, summary = (read_json(file) if file.exists() else {} for file in files)
+    files = (folder / f"{name}.json" for name in ("config", "versions"))
+    config, versions = (read_json(file) if file.exists() else {} for file in files)
+    summary = read_present_summary(folder, rows)
     warn_of_lost_rows(folder, len(rows), summary.pop("num_rows", None))
     target = _first_number(config, _TARGET_KEYS)
-    page = Page(_title(config, folder), lead=_lead(rows, target))
+    page = Page(_title(config, folder), lead=_lead(rows, summary, target))
     _outcome(page, folder, rows, summary, target)
     page.heading("Learning curve")
     page.figure(learning_curve_svg(rows, target), curve_words(rows))
@@ -78,11 +79,7 @@ def _outcome(page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str
     path = folder / DRAWING_NAME
     drawn = grid_svg(read_json(path)) if path.exists() else None
     if drawn is not None:
-        page.figure(
-            drawn,
-            "Arrows are greedy actions, those of states that were never visited pale; a frame marks one that is not "
-            "optimal. On the right, or below, how far the value of each state is from the exact one.",
-        )
+        page.figure(*drawn)
 
 
 def _soundness(page: Page, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
@@ -134,11 +131,13 @@ def _title(config: Mapping[str, Any], folder: Path) -> str:
     return f"{name}: what was learned"
 
 
-def _lead(rows: Sequence[Row], target: float | None) -> str:
+def _lead(rows: Sequence[Row], summary: Mapping[str, Any], target: float | None) -> str:
     steps, returns = finite_series(rows, "evaluation", "greedy_return")
     if not len(steps):
         return _measured(rows) or "No greedy evaluation has been recorded yet."
     text = f"After {steps[-1]:,.0f} environment steps the greedy policy scores {returns[-1]:.4g} per episode."
+    if (kept := kept_words(summary)) is not None:
+        text = f"The agent that was kept scores {kept[0]} per episode ({kept[1]}). {text}"
     if target is None:
         return text
     reached = steps[returns >= target]

@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from neuralq.runs.folder.run_folder import read_config
+from neuralq.runs.play_off import Score
 from neuralq.runs.report.comparison import Group, comparison_svg, read_groups
 from neuralq.runs.report.page import Page, short_number, tiles
 
@@ -48,8 +49,12 @@ def _tiles(group: Group) -> list[tuple[str, str, str]]:
         interval = f"95 % interval {short_number(found.low)} to {short_number(found.high)}"
     spread = f"{short_number(min(group.returns))} to {short_number(max(group.returns))}"
     return [
-        ("final return", short_number(found.iqm), f"interquartile mean over {len(group.runs)} seeds, {interval}"),
-        ("lowest and highest seed", spread, "final greedy return"),
+        (
+            "return of the agents",
+            short_number(found.iqm),
+            f"interquartile mean over {len(group.runs)} seeds, {interval}",
+        ),
+        ("lowest and highest seed", spread, "greedy return of the agent"),
         ("environment steps", f"{steps:,}", f"of the longest run; {short_number(seconds)} CPU-seconds in all"),
     ]
 
@@ -62,12 +67,18 @@ def _seeds(group: Group, folder: Path) -> str:
         where = escape(os.path.relpath(page, folder), quote=True)
         told = f'<a href="{where}">{name}</a>' if page.exists() else name
         cells = (
+            _with_error(run.score),
             short_number(run.returns[-1]),
             short_number(run.returns.max()),
             f"{run.env_steps:,}",
             short_number(run.cpu_seconds),
         )
         body += f'<tr><th scope="row">{told}</th>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>\n"
-    heads = ("", "final return", "best evaluation", "environment steps", "CPU-seconds")
+    heads = ("", "return of the agent", "last evaluation", "best evaluation", "environment steps", "CPU-seconds")
     head = "".join(f'<th scope="col">{one}</th>' for one in heads)
     return f'<div class="scroll"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>\n</table></div>'
+
+
+def _with_error(score: Score) -> str:
+    error = "" if score.standard_error is None else f" ± {short_number(score.standard_error, 2)}"
+    return f"{short_number(score.mean)}{error}{' (best parameters)' if score.agent == 'best' else ''}"

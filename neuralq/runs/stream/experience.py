@@ -29,11 +29,13 @@ class Sample:
         transition: experience in the shape that the learner takes.
         weight: one per row, 0 where a row is no experience; None for all ones.
         indices: where the rows are stored, if their priorities are wanted back.
+        reward_scale: by what its rewards were multiplied before the learner does, where a hook is to know.
     """
 
     transition: Transition
     weight: Tensor | None = None
     indices: Array | None = None
+    reward_scale: float = 1.0
 
 
 class ExperienceSource(Protocol):

@@ -23,6 +23,7 @@ from neuralq.runs.folder.files import (
     write_durably,
 )
 from neuralq.runs.folder.run_folder import read_summary
+from neuralq.runs.play_off import score_of
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.sweep.folder import Sweep, has_finished, steps_so_far
 from neuralq.runs.sweep.statistics import Estimate, estimate
@@ -61,9 +62,9 @@ class SweepResult:
 
     @property
     def returns(self) -> list[float]:
-        """Final greedy returns of the finished seeds."""
-        found = (run.summary.get("greedy_return") for run in self.runs if run.state == "finished")
-        return [float(value) for value in found if value is not None]
+        """What the agents of the finished seeds score."""
+        found = (score_of(run.summary) for run in self.runs if run.state == "finished")
+        return [score.mean for score in found if score is not None]
 
     @property
     def estimate(self) -> Estimate | None:
@@ -73,7 +74,7 @@ class SweepResult:
     def plain(self) -> dict[str, Any]:
         """The same as plain values."""
         found = self.estimate
-        numbers = ("greedy_return", "env_steps", "cpu_seconds", "reached", "parameters_sha256")
+        numbers = ("agent_return", "greedy_return", "env_steps", "cpu_seconds", "reached", "parameters_sha256")
         return {
             "iqm": None if found is None else found.iqm,
             "low": None if found is None else found.low,
@@ -99,7 +100,7 @@ class Status:
         running: seeds at work.
         num_finished: seeds that have finished.
         failed: seeds that have failed.
-        returns: final greedy returns so far.
+        returns: what the agents of those that have finished score.
     """
 
     env_steps: int
@@ -224,10 +225,10 @@ class _Processes:
     def status(self) -> Status:
         total = self.sweep.total_steps
         finished = [seed for seed in self.sweep.seeds if seed not in self.running and has_finished(self.sweep, seed)]
-        returns = (read_summary(self.sweep.run_path(seed)).get("greedy_return") for seed in finished)
+        scores = (score_of(read_summary(self.sweep.run_path(seed))) for seed in finished)
         others = (steps_so_far(self.sweep.run_path(seed)) for seed in self.sweep.seeds if seed not in finished)
         steps = len(finished) * total + sum(min(total, steps) for steps in others)
-        kept = tuple(float(value) for value in returns if value is not None)
+        kept = tuple(score.mean for score in scores if score is not None)
         return Status(
             steps, total * len(self.sweep.seeds), tuple(self.running), len(finished), tuple(self.reasons), kept
         )
