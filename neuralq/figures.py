@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "MARKERS", "at_least", "draw_png", "draw_svg", "scale_axis", "steps_axis", "tame"]
+__all__ = ["COLOURS", "MARKERS", "at_least", "band", "draw_png", "draw_svg", "scale_axis", "steps_axis", "tame"]
 
 # Okabe and Ito (2008), "Color universal design": told apart with every common colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -144,6 +144,15 @@ def tame(values: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Values within what can be drawn: NaN and infinities become gaps, huge ones go to the edge."""
     array = np.asarray(values, np.float64)
     return np.where(np.isfinite(array), np.clip(array, -_HUGE, _HUGE), np.nan)
+
+
+def band(axes: Axes, x: np.ndarray[Any, Any], low: Any, high: Any, colour: str, label: str = "") -> None:
+    """What lies between two curves, filled; an upright line where there is one point."""
+    low, high = tame(low), tame(high)
+    if len(x) == 1:
+        axes.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3, label=label)
+    else:
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, label=label)
 
 
 def scale_axis(axes: Axes, values: np.ndarray[Any, np.dtype[np.float64]]) -> None:

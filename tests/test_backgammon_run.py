@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +26,7 @@ import pytest
 
 import neuralq
 from neuralq.apps.cli import main
+from neuralq.apps.pages.gammon import points_against
 from neuralq.runs.folder.run_folder import RunFolderError, read_config, read_metrics, read_summary
 from neuralq.systems.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
 from neuralq.systems.backgammon.config import TdGammonConfig, config_from_dict, config_to_dict
@@ -223,9 +226,37 @@ def test_bad_options_are_one_clear_error(options: str, expected: str, capsys: py
     assert len(lines) == 1 and lines[0].startswith("neuralq: ") and expected in lines[0]
 
 
+def test_a_run_has_a_page_with_its_points_and_openings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = configuration(replace(SMALL, num_games=6), evaluate_every=3, evaluation_games=4)
+    run = train_games(config, tmp_path / "run")
+    assert main(["report", str(run.run_dir)]) == 0
+    assert capsys.readouterr().out.strip() == str(run.run_dir / "report.html")
+    page = (run.run_dir / "report.html").read_text()
+    text = re.sub("<[^>]+>", " ", page)
+    points, error = run.points_per_game["random"]
+    assert f"{abs(points):.3f} ± {error:.3f} points per game against random play" in text
+    assert f"{points - 1.96 * error:+.3f} to {points + 1.96 * error:+.3f}" in text
+    rows = [row for row in read_metrics(run.run_dir) if row["kind"] == "evaluation"]
+    assert [curve.tolist() for curve in points_against(rows, "random")][:2] == [
+        [3.0, 6.0], [row["ppg_random"] for row in rows]
+    ]  # fmt: skip
+    assert f"{run.games} games by TD(λ)" in text and f"{load_agent(run.run_dir).network.flat.size:,} weights" in text
+    best = load_agent(run.run_dir).ranked_turns(Position.initial(), (2, 1), 1)[0]
+    cells = re.findall(r'<th scope="row">2-1</th><td>([^<]+)</td><td>([^<]+)</td><td>([^<]+)</td>', page)
+    assert [cells[0][1:]] == [(f"{best.equity:+.3f}", f"{best.chances.win:.0%}")]
+    played = [list(map(int, step.split("/"))) for step in re.findall(r"\d+/\d+", cells[0][0])]
+    pips = [sum((i + 1) * n for i, n in enumerate(row)) for row in (Position.initial().own, best.position.other)]
+    assert sum(a - b for a, b in played) <= 3 == pips[0] - pips[1]  # of equal moves one is written
+    assert page.count('scope="row">') > 15 and page.count('class="boards"') == 1 and "<script" not in page
+    shutil.rmtree(run.run_dir / "checkpoints")
+    (run.run_dir / "weights.safetensors").write_bytes(b"no weights")
+    assert main(["report", str(run.run_dir)]) == 0
+    assert "Its weights cannot be read" in (run.run_dir / "report.html").read_text()
+
+
 def test_commands_for_other_runs_refuse_this_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = train_games(configuration(replace(SMALL, num_games=2), evaluate_against=()), tmp_path / "run").run_dir
-    commands = ("report", "compare", "watch", "record --gif a.gif", "export --onnx a.onnx", "resume --total-steps 9")
+    commands = ("compare", "watch", "record --gif a.gif", "export --onnx a.onnx", "resume --total-steps 9")
     for command in (
         *commands,
         "resume --workers 2",

@@ -29,7 +29,9 @@ from neuralq.apps.chapter.prediction import lambda_recursion, random_walk_page
 from neuralq.apps.chapter.tic_tac_toe import exercise_13_3
 from neuralq.apps.cli import main
 from neuralq.apps.pages.grids import best_actions
-from neuralq.apps.pages.page import (
+from neuralq.apps.pages.svg import page_svg
+from neuralq.apps.pages.text import drawing_lines
+from neuralq.runs.report.claims import (
     Arrow,
     ChapterPage,
     Chart,
@@ -42,8 +44,7 @@ from neuralq.apps.pages.page import (
     number,
     own,
 )
-from neuralq.apps.pages.svg import page_svg
-from neuralq.apps.pages.text import drawing_lines
+from neuralq.systems import SYSTEMS
 
 Capture = pytest.CaptureFixture[str]
 
@@ -226,11 +227,14 @@ def test_an_arrow_points_where_it_says() -> None:
 
 def test_the_command_lists_and_runs_pages(tmp_path: Path, capsys: Capture) -> None:
     assert main(["chapter"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == NAMES
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*NAMES, *SYSTEMS]
     assert main(["chapter", "--json"]) == 0
-    assert list(json.loads(capsys.readouterr().out)["pages"]) == NAMES
-    path = tmp_path / "grid.svg"
-    assert main(["chapter", "fig-13.2", "--svg", str(path)]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert list(listed["pages"]) == NAMES and list(listed["systems"]) == list(SYSTEMS)
+    path, page = tmp_path / "grid.svg", tmp_path / "grid.html"
+    assert main(["chapter", "fig-13.2", "--svg", str(path), "--html", str(page)]) == 0
+    html = page.read_text()
+    assert "V* and every optimal move" in html and "✓ agrees" in html and html.count("<svg") == 1
     out = capsys.readouterr().out
     assert "72.9" in out and "misprint" in out and "│ 81 ↑→ │ 90 ↑→ │ 100 ↑ │" in out
     texts = ["".join(element.itertext()) for element in ElementTree.parse(path).iter()]
@@ -254,7 +258,7 @@ def test_a_number_that_is_not_reproduced_ends_with_status_1(monkeypatch: pytest.
 
 def test_wrong_usage(capsys: Capture) -> None:
     assert main(["chapter", "--svg", "x.svg"]) == 2
-    assert "needs a page" in capsys.readouterr().err
+    assert "need a name" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main(["chapter", "fig-13.9"])
 

@@ -436,9 +436,11 @@ def test_commands_run_without_docstrings_and_assertions(tmp_path: Path) -> None:
 
 def test_where_there_are_no_file_locks_it_is_said_in_one_line() -> None:
     """As on Windows."""
-    code = "import sys; sys.modules['fcntl'] = None\nfrom neuralq.apps.cli import main\nsys.exit(main(['presets']))"
+    code = (
+        "import sys; sys.modules['fcntl'] = None\ntry: from neuralq import train\n"
+        "except ImportError as error: print(error)\n"
+        "from neuralq.apps.cli import main\nsys.exit(main(['presets']))"
+    )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and "WSL 2" in ended.stderr
-    code = "import sys; sys.modules['fcntl'] = None\nfrom neuralq import train"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert ended.stderr.strip().splitlines()[-1].startswith("ImportError: neuralq runs on Linux and macOS")
+    assert ended.stdout.startswith("neuralq runs on Linux and macOS")

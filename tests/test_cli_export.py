@@ -68,10 +68,10 @@ def trained(path: Path, env: str, *words: str) -> str:
     [
         ("CartPole-v1", ["--layout", "action-output", "--layer-norm", "true", "--reward-scale", "0.01"], [4]),
         ("CartPole-v1", ["--layout", "action-input"], [4]),
-        ("CartPole-v1", ["--layout", "separate"], [4]),
-        ("CartPole-v1", ["--layout", "linear"], [4]),
+        pytest.param("CartPole-v1", ["--layout", "separate"], [4], marks=pytest.mark.slow),
+        pytest.param("CartPole-v1", ["--layout", "linear"], [4], marks=pytest.mark.slow),
         ("neuralq/MitchellGrid-v0", ["--layout", "table"], []),  # a state, and 4 legal moves beside it
-        ("FrozenLake-v1", ["--layout", "action-output"], []),
+        pytest.param("FrozenLake-v1", ["--layout", "action-output"], [], marks=pytest.mark.slow),
         ("test/Offset-v0", [], [2, 12, 12]),
     ],
 )
@@ -224,8 +224,14 @@ CASES = [(which, "action-output", which == "wide") for which in SPACES]
 CASES += [("start", "table", False), ("digits", "table", False), ("dict", "linear", False), ("dict", "linear", True)]
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize(("which", "layout", "normalised"), CASES)
+@pytest.mark.parametrize(
+    ("which", "layout", "normalised", "masked"),
+    [  # each case once in the fast lane, every second one masked
+        pytest.param(*case, masked, marks=[] if masked == bool(number % 2) else pytest.mark.slow)
+        for number, case in enumerate(CASES)
+        for masked in (False, True)
+    ],
+)
 def test_the_file_takes_what_the_environment_gives(
     which: str, layout: str, normalised: bool, masked: bool, tmp_path: Path
 ) -> None:

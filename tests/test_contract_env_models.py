@@ -44,10 +44,12 @@ WITHOUT_MODEL = {
     "neuralq/Acrobot-v0": TO_THE_BIT,
     "neuralq/Backgammon-v0": "some 10^20 positions",
     "neuralq/MountainCar-v0": TO_THE_BIT,
+    "neuralq/PoleBoxes-v0": "the next box depends on more than the box",
 }
 WITHOUT_TWIN = {
     "neuralq/Backgammon-v0": "has no model to simulate",
     "neuralq/BlockingMaze-v0": "two models in turn, by a clock of its own",
+    "neuralq/PoleBoxes-v0": "has no model to simulate",
     "neuralq/ShortcutMaze-v0": "two models in turn, by a clock of its own",
 }
 NOISE = {"neuralq/MaximizationBias-v0": "standard_deviation"}  # of rewards about the model's; the model is deaf to it

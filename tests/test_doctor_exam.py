@@ -246,6 +246,9 @@ def test_a_time_limit_reported_as_termination_is_told_from_a_real_end() -> None:
     assert environment.disguised_limit(disguised).flagged
     assert not environment.disguised_limit(honest).flagged
     assert environment.disguised_limit(shown).value == 1 and not environment.disguised_limit(shown).flagged
+    drifts = case_of(lambda: Counting(ends=30, shows=lambda t, rng: [t + rng.normal()]), both(np.abs))
+    found = environment.disguised_limit(drifts)  # told from those before it, but no better than the 29th from its own
+    assert found.flagged and 0.85 < found.value < 0.95 and found.threshold is not None and found.threshold > 0.85
 
 
 def test_scales_of_observations_and_rewards_are_measured() -> None:

@@ -141,9 +141,9 @@ def test_the_model_has_the_values_of_the_recursion_everywhere(opponent: str, pla
     [
         ("random", "X", best, (0.99479, 0.00521, 0.0)),
         ("random", "O", best, (0.93228, 0.06032, 0.00741)),
-        ("random", "X", average, (0.58492, 0.12698, 0.28810)),
-        ("random", "O", average, (0.28810, 0.12698, 0.58492)),
-        ("optimal", "X", best, (0.0, 1.0, 0.0)),
+        pytest.param("random", "X", average, (0.58492, 0.12698, 0.28810), marks=pytest.mark.slow),
+        pytest.param("random", "O", average, (0.28810, 0.12698, 0.58492), marks=pytest.mark.slow),
+        pytest.param("optimal", "X", best, (0.0, 1.0, 0.0), marks=pytest.mark.slow),
         ("optimal", "O", best, (0.0, 1.0, 0.0)),
         ("optimal", "O", average, (0.0, 0.03219, 0.96781)),
         ("optimal", "X", average, (0.0, 0.22252, 0.77748)),

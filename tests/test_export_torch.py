@@ -89,8 +89,14 @@ def untrained(which: str, masked: bool = False, normalised: bool = False, **sett
     return config, Agent(q, stream.encoder, stream.spec, -1, 0.1, None if seen is None else seen.frozen())
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(
+    ("case", "masked"),
+    [  # each case once in the fast lane, every second one masked
+        pytest.param(case, masked, marks=[] if masked == bool(number % 2) else pytest.mark.slow)
+        for number, case in enumerate(CASES)
+        for masked in (False, True)
+    ],
+)
 def test_the_lines_give_the_agents_values(case: str, masked: bool, tmp_path: Path) -> None:
     which, settings = CASES[case]
     config, agent = untrained(which, masked, **settings)

@@ -226,7 +226,7 @@ def test_fitted_evaluation_finds_the_projected_fixed_point(seed):
     np.testing.assert_allclose(ran.path[-1], expected, rtol=1e-6, atol=1e-8)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_fitted_q_iteration_with_a_table_is_value_iteration(seed):
     mdp = FiniteMDP.garnet(5, 2, 2, seed=seed)

@@ -144,8 +144,8 @@ def test_settings_of_the_environment_that_are_left_out_are_missed(tmp_path: Path
     [
         ("versions", "torch", "1.0.0"),
         ("arithmetic", "BLAS kernel of openblas", "Prescott 0.3"),
-        ("arithmetic", "NUMBA_DISABLE_JIT", "1"),
-        ("arithmetic", "instructions of torch", "DEFAULT"),
+        pytest.param("arithmetic", "NUMBA_DISABLE_JIT", "1", marks=pytest.mark.slow),
+        pytest.param("arithmetic", "instructions of torch", "DEFAULT", marks=pytest.mark.slow),
     ],
 )
 def test_what_decides_the_bits_and_differs_is_named_and_the_promise_is_taken_back_for_good(

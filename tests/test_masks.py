@@ -119,8 +119,10 @@ LEARNERS: dict[str, dict[str, Any]] = {
 }
 CASES = [
     *((name, "linear") for name in LEARNERS),
-    *((name, "table") for name in ("rollout peng", "dqn", "quantile", "online", "streaming", "qrc")),
-    *((name, "action-output") for name in ("rollout watkins", "dqn", "double", "online", "streaming", "qrc")),
+    *((name, "table") for name in ("dqn", "streaming")),
+    *((name, "action-output") for name in ("rollout watkins", "qrc")),
+    *(pytest.param(name, "table", marks=pytest.mark.slow) for name in ("rollout peng", "quantile", "online", "qrc")),
+    *(pytest.param(name, "action-output", marks=pytest.mark.slow) for name in ("dqn", "double", "online", "streaming")),
 ]
 BOUND = 15.0  # no return exceeds 5, and the control shows what seeing the illegal action does
 STEPS = 240
@@ -312,8 +314,15 @@ class Strict(Tempting):
 gym.register("Strict-v0", Strict)
 
 
-@pytest.mark.parametrize("layout", ["table", "action-output"])
-@pytest.mark.parametrize("told", ["info", "action_masks"])
+@pytest.mark.parametrize(
+    ("layout", "told"),
+    [
+        ("table", "info"),
+        ("action-output", "action_masks"),
+        pytest.param("table", "action_masks", marks=pytest.mark.slow),
+        pytest.param("action-output", "info", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(
     ("learner", "settings"),
     [

@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from neuralq.apps.cli import main
 from neuralq.apps.cli.faults import explained, own_frame
+from neuralq.figures import draw_svg
 from neuralq.runs import RunConfig
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.recipe import build
@@ -257,6 +258,7 @@ def test_a_missing_extra_is_named(missing: str, monkeypatch: pytest.MonkeyPatch,
     if "run" in words:
         assert train("CartPole-v1") == 0
     capsys.readouterr()
+    monkeypatch.setattr("neuralq.runs.report.curves.draw_svg", draw_svg)
     imported = builtins.__import__
 
     def without(name: str, *given: Any, **more: Any) -> Any:

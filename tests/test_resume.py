@@ -154,7 +154,8 @@ SERVER = """
 import json, os, sys
 import torch
 torch.set_num_threads(1)
-from neuralq.apps.cli import main
+from neuralq.apps.cli import main, runs
+runs.write_report = lambda path: path
 main(json.loads(sys.argv[1]))
 print("ready", flush=True)
 for line in sys.stdin:
@@ -206,9 +207,9 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
     started.server.stdout.close()
 
 
-STEPS = 24_000
+STEPS = 12_000
 KILLED = ["--total-steps", str(STEPS), "--rollout.num-envs", "8", "--rollout.num-steps", "16", "--hidden", "32"]
-KILLED += ["--evaluate-every", "6000", "--evaluation-episodes", "1", "--preset", "false", "--seed", "5"]
+KILLED += ["--evaluate-every", "3000", "--evaluation-episodes", "1", "--preset", "false", "--seed", "5"]
 
 
 @pytest.fixture(scope="module")

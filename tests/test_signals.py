@@ -84,7 +84,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             EVALUATING.pop()
 
     monkeypatch.setattr(Session, "play_greedily", played)
+    heard = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may have been started by `nohup`
     yield
+    signal.signal(signal.SIGHUP, heard)
     gym.registry.pop("Signalled-v0")
     SENT.clear()
 
@@ -93,8 +95,17 @@ def clockless(path: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if k not in CLOCKS} for row in read_metrics(path)]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-@pytest.mark.parametrize("which", [0, 2])  # in the middle, and at the end of the budget
+@pytest.mark.parametrize(
+    ("which", "number"),  # in the middle, and at the end of the budget
+    [
+        (0, signal.SIGTERM),
+        (0, signal.SIGINT),
+        (2, signal.SIGHUP),
+        pytest.param(0, signal.SIGHUP, marks=pytest.mark.slow),
+        pytest.param(2, signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(2, signal.SIGINT, marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_in_an_evaluation_ends_it_at_once_and_the_resumed_run_makes_up_for_it(
     number: int, which: int, tmp_path: Path
 ) -> None:

@@ -66,7 +66,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-QUICK = ("obgd", "intentional", "table", "vectorised twin")
+QUICK = ("obgd", "intentional", "table")
 
 
 @pytest.mark.parametrize(

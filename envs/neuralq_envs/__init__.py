@@ -1,8 +1,8 @@
 """Environments with a known answer: each gives its exact `FiniteMDP` beside the Gymnasium interface.
 
-Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`), and games too large for an exact model
-(`GAMES`). Importing this package registers them all, and Gymnasium imports it by itself where an id names it:
-``gymnasium.make("neuralq_envs:neuralq/MitchellGrid-v0")``.
+Beside them stand two of Gymnasium's own problems, vectorised (`CLASSIC`), and what has no exact model, or one too large
+to write down (`WITHOUT_MODEL`). Importing this package registers them all, and Gymnasium imports it by itself where an
+id names it: ``gymnasium.make("neuralq_envs:neuralq/MitchellGrid-v0")``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from gymnasium.envs import registration
 from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["CLASSIC", "ENVIRONMENTS", "GAMES", "Classic", "Registration", "register", "vector_twin"]
+__all__ = ["CLASSIC", "ENVIRONMENTS", "WITHOUT_MODEL", "Classic", "Registration", "register", "vector_twin"]
 
 
 class Registration(NamedTuple):
@@ -24,11 +24,13 @@ class Registration(NamedTuple):
         module: where the functions are (`neuralq_envs.rendering.factories` makes them); imported when first needed.
         kwargs: arguments of both functions.
         has_vector: whether there is a `make_vector`; a world that changes with time is not one model to simulate.
+        max_episode_steps: steps after which Gymnasium truncates an episode; None for never.
     """
 
     module: str
     kwargs: Mapping[str, Any] = MappingProxyType({})
     has_vector: bool = True
+    max_episode_steps: int | None = None
 
 
 ENVIRONMENTS = {
@@ -50,8 +52,10 @@ ENVIRONMENTS = {
     "neuralq/WindyGridworld-v0": Registration("neuralq_envs.windy"),
 }
 
-GAMES = {
+WITHOUT_MODEL = {
     "neuralq/Backgammon-v0": Registration("neuralq_envs.backgammon.single_agent", has_vector=False),
+    # A pole that is balanced for good would never end an episode.
+    "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
 }
 
 
@@ -125,13 +129,14 @@ def register() -> None:
         >>> gymnasium.make("neuralq/MitchellGrid-v0").observation_space
         Discrete(6)
     """
-    for env_id, one in (ENVIRONMENTS | GAMES).items():
+    for env_id, one in (ENVIRONMENTS | WITHOUT_MODEL).items():
         if env_id not in registration.registry:
             registration.register(
                 env_id,
                 entry_point=f"{one.module}:make",
                 vector_entry_point=f"{one.module}:make_vector" if one.has_vector else None,
                 kwargs=dict(one.kwargs),
+                max_episode_steps=one.max_episode_steps,
             )
     for env_id, classic in CLASSIC.items():
         if env_id not in registration.registry:

@@ -21,6 +21,8 @@ from neuralq.doctor.subject import Settings, Subject, with_settings
 from neuralq.doctor.tree import decide
 from neuralq.doctor.weights import CannotLoad, plain_bytes, read_arrays
 from neuralq.doctor.worlds import World, open_world
+from neuralq.runs.offline.files import read_recorded
+from neuralq.runs.offline.recorded import recorded_from
 from neuralq.types import Array
 
 __all__ = ["LEVELS", "NUM_PARTS", "examine"]
@@ -87,8 +89,9 @@ def examine(
         env: a Gymnasium id, "module:id", an environment, or a class or function that makes one; of a run folder its own
             by default.
         gamma: γ; by default what the file says, else 0.99.
-        data: what was learned from: the path of an ``.npz``, or a mapping of the columns ``obs, action, reward,
-            terminated, truncated, next_obs`` and perhaps ``age``.
+        data: what was learned from: the path of an ``.npz``, "minari:ID" of a data set of Minari's (extra minari), or a
+            mapping of the columns ``obs, action, reward, terminated, truncated, next_obs`` and perhaps ``age``; or laid
+            out as D4RL's. By default what a neuralq run keeps in its replay.
         settings: of the training, where the file does not say: fields of `Settings`, such as
             ``{"target_period_updates": 500, "updates": 50_000}``.
         net: "module:Class" of a network that a state dict belongs to.
@@ -113,7 +116,7 @@ def examine(
     check_whole("seed", seed, 0)
     check_whole("seeds", seeds, 2)
     clock = Clock(budget_s)
-    loaded = load_subject(subject, net)
+    loaded = load_subject(subject, net, None if isinstance(env, Mapping) else env)
     given = env if env is not None else loaded.env
     if given is None:
         raise ValueError("which environment the subject was trained in is not known; pass env (--env ID)")
@@ -121,7 +124,7 @@ def examine(
     discount = gamma if gamma is not None else known.gamma if known.gamma is not None else _GAMMA
     check_discount("gamma", discount)
     world = open_world(given)
-    columns = _columns(data)
+    columns = _columns(data) or (loaded.replay() if loaded.replay is not None else None)
     _check_fits(loaded, world)
     say = _Teller(progress)
     threads = torch.get_num_threads()
@@ -199,10 +202,12 @@ def _broken(subject: Subject, world: World, gamma: float, clock: Clock, what: st
 def _columns(data: Any) -> dict[str, Array] | None:
     if data is None:
         return None
+    if isinstance(data, str) and data.startswith("minari:"):
+        return stored.of_recorded(read_recorded(data))
     if isinstance(data, str | Path):
-        return stored.check_columns(read_arrays(plain_bytes(Path(data)), str(data)))
+        data = read_arrays(plain_bytes(Path(data)), str(data))
     if isinstance(data, Mapping):
-        return stored.check_columns(data)
+        return stored.of_recorded(recorded_from(data)) if "observations" in data else stored.check_columns(data)
     raise ValueError(f"data must be the path of an .npz or a mapping of columns, got {type(data).__name__}")
 
 

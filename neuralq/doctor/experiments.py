@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.exam.network import fresh
+from neuralq.doctor.exam.retraining import further_reach, in_words, settings_of
 from neuralq.doctor.findings import Cause, Finding
 from neuralq.doctor.play import returns_from
 from neuralq.runs import train
@@ -196,11 +197,12 @@ def _repair(case: Case, one: Finding) -> _Repair | None:
     """The change that a finding asks for; None where none can be made in a learner of ours."""
     known, make = case.settings, case.world.make
     rate = known.learning_rate or 5e-4
+    further = {name: value for name, value in further_reach(case).items() if name != "total_steps"}
     changes: dict[str, tuple[str, dict[str, Any], Maker | None]] = {
         "R1": (f"step size {rate / 10:.2g} in place of {rate:.2g}", {"learning_rate": rate / 10}, None),
         "R6a": ("step size 5e-4", {"learning_rate": 5e-4}, None),
         "V4": ("the target network copied every 500 updates", {"target_period_updates": 500}, None),
-        "V5": ("a target of 10 steps, copied every 200 updates", {"target_period_updates": 200, "num_steps": 10}, None),
+        "V5": (in_words(further), further, None),
         "V2": ("double Q-learning", {"target_rule": "double"}, None),
         "D3": ("a buffer of 50,000 steps", {"capacity": 50_000}, None),
         "D4": ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None),
@@ -234,26 +236,12 @@ class _Plan:
 
     def theirs(self) -> dict[str, Any]:
         """The subject's settings as far as they are known; where not, those of neuralq's replay."""
-        known = self.case.settings
-        asked = {
-            "learning_rate": known.learning_rate, "batch_size": known.batch_size, "capacity": known.capacity,
-            "target_period_updates": known.target_period_updates, "num_steps": known.num_steps,
-        }  # fmt: skip
-        whole = {"batch_size", "capacity", "target_period_updates", "num_steps"}
-        given = {k: max(int(v), 1) if k in whole else v for k, v in asked.items() if v is not None}
-        if known.updates and known.env_steps:
-            given["train_period"] = max(round(known.env_steps / known.updates), 1)
-        if "capacity" in given:
-            given["learning_starts"] = min(1000, given["capacity"])
-            given["batch_size"] = min(given.get("batch_size", 64), given["capacity"])
-        explores = {"epsilon_start": known.epsilon_start, "epsilon_end": known.epsilon_end}
-        return {"learner": "replay", **given, **{k: v for k, v in explores.items() if v is not None}}
+        known = settings_of(self.case)
+        return {name: value for name, value in known.items() if name not in ("hidden", "epsilon_decay_steps")}
 
     def their_body(self) -> dict[str, Any]:
         """The widths of the subject's dense layers; neuralq's default where they are not known."""
-        network = self.case.subject.network
-        linear = [] if network is None else [m for m in network.modules() if isinstance(m, nn.Linear)]
-        return {"hidden": tuple(m.out_features for m in linear[:-1])} if len(linear) > 1 else {}
+        return {name: value for name, value in settings_of(self.case).items() if name == "hidden"}
 
     def steps_for(self, runs: int) -> int:
         """Steps of each of so many runs in what is left of the budget.
@@ -275,11 +263,14 @@ class _Plan:
 
     def run(self, settings: Mapping[str, Any], seed: int, steps: int, make: Maker | None) -> float:
         """The greedy return that one run ends with."""
+        known = self.case.settings
+        decay = (known.epsilon_decay_steps or 0.0) / known.env_steps if known.env_steps else 0.0
+        explores = max(int(min(decay or 0.2, 1.0) * steps), 1)
         with tempfile.TemporaryDirectory() as folder:
             made = train(
                 make or self.case.world.make, Path(folder) / "run", preset=False, seed=seed, total_steps=steps,
                 gamma=self.case.gamma, evaluate_every=steps, evaluation_episodes=10, evaluation_max_steps=1000,
-                checkpoint_every=10 * steps, resume_probe=False, epsilon_decay_steps=max(steps // 5, 1), **settings,
+                checkpoint_every=10 * steps, resume_probe=False, epsilon_decay_steps=explores, **settings,
             )  # fmt: skip
         return float(made.greedy_return if made.greedy_return is not None else np.nan)
 

@@ -9,14 +9,14 @@ from torch import nn
 
 from neuralq.doctor.origins import ORIGINS
 from neuralq.doctor.origins.neuralq_run import of_agent
-from neuralq.doctor.subject import Settings, Subject, of_callable, of_network
+from neuralq.doctor.subject import Subject, of_callable, of_network
 from neuralq.doctor.weights import EXPORT, CannotLoad
 from neuralq.runs.agent import Agent
 
 __all__ = ["load_subject"]
 
 
-def load_subject(given: Any, net: str | None = None) -> Subject:
+def load_subject(given: Any, net: str | None = None, env: Any = None) -> Subject:
     """The value function in a file or folder, or in memory. No code in a file is ever run.
 
     Args:
@@ -24,6 +24,7 @@ def load_subject(given: Any, net: str | None = None) -> Subject:
             state dict (``.pth``, ``.safetensors``, ``.npz``); an `nn.Module`, a function of ``[N, *obs]`` to
             ``[N, A]``, or what `neuralq.load` returns.
         net: "module:Class" of a network that a state dict belongs to; it is called without arguments.
+        env: the environment, of a run in whose folder it has no name that could be followed.
 
     Raises:
         CannotLoad: which key or shape does not fit, and what to pass.
@@ -35,7 +36,7 @@ def load_subject(given: Any, net: str | None = None) -> Subject:
     if isinstance(given, Subject):
         return given
     if isinstance(given, Agent):
-        return of_agent(given, "an agent of neuralq", Settings(reward_scale=given.reward_scale))
+        return of_agent(given)
     if isinstance(given, nn.Module):
         return of_network(given, f"{type(given).__name__}, a PyTorch module")
     if hasattr(given, "run_dir"):
@@ -49,7 +50,7 @@ def load_subject(given: Any, net: str | None = None) -> Subject:
         raise CannotLoad(f"there is no {path}; give a run folder or the file of a saved agent")
     for origin in ORIGINS:
         if origin.recognises(path):
-            return origin.load(path, net)
+            return origin.load(path, net, env)
     known = "; ".join(origin.name for origin in ORIGINS)
     raise CannotLoad(
         f"{path} is none of: {known}. From PyTorch: {EXPORT.splitlines()[1]}, read with --net module:Class"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,26 +53,28 @@ class Report:
         return None if self.healthy or unexplained else self.findings[0].cause
 
     def explain(self) -> str:
-        """The report in one screen of text."""
+        """The report in one screen of text, 24 lines of 80."""
         return "\n".join(self.lines())
 
-    def lines(self, width: int = 110) -> list[str]:
-        """The same line by line: the headline, the first findings, the table of causes, what was not measured."""
-        lines = [f"{self.subject} on {self.env}, γ = {self.gamma:g}", self.headline]
-        named = [one for one in self.findings if one.grade in "AB"][:4]
-        for one in named:
-            lines += ["", *_wrapped(one.line(), width), *_wrapped(f"    remedy: {one.remedy}", width, 12)]
-            lines += [f"    confirm: {line}" for line in one.confirm.splitlines()[:3]]
-        more = len([one for one in self.findings if one.grade in "AB"]) - len(named)
-        if more > 0:
-            lines.append(f"and {more} more, in the report and with --json")
-        lines += ["", *(f"{cause:<15} {self._best_of(cause)}" for cause in CAUSES)]
-        signs = [f"{one.id} {one.title}" for one in self.findings if one.grade == "C"]
-        if signs:
-            lines += _wrapped(f"vital signs, no verdicts: {', '.join(signs)}", width)
-        if self.not_measured:
-            lines += _wrapped(f"not measured (why: --json): {', '.join(self.not_measured)}", width)
-        return [*lines, f"{len(self.measured)} measurements in {self.seconds:.0f} s"]
+    def lines(self) -> list[str]:
+        """The same line by line: the headline, the first finding, the table of causes, what was not measured."""
+        named, signs = ([one for one in self.findings if (one.grade == "C") == c] for c in (False, True))
+        lines = _wrapped(f"{self.subject} on {self.env}, γ = {self.gamma:g}", 2) + _wrapped(self.headline, 2)
+        for one in named[:1]:
+            lines += ["", *_wrapped(f"[{one.grade}] {one.id}: {one.evidence}", 3)]
+            lines += _wrapped(f"remedy: {one.remedy}", 2)
+            lines += _wrapped(f"confirm: {one.confirm.splitlines()[0]}", 3)
+        lines += ["", *(_wrapped(f"{cause:<15} {self._best_of(cause)}", 1)[0] for cause in CAUSES)]
+        for title, rest in (
+            ("and", [f"{one.id} {one.title}" for one in named[1:]]),
+            ("signs, no verdicts", [f"{one.id} {one.title}" for one in signs]),
+            ("not measured (why: --json)", list(self.not_measured)),
+        ):
+            lines += _wrapped(f"{title}: {', '.join(rest)}", 2 if title == "and" else 1) if rest else []
+        return [
+            *lines,
+            f"{len(self.measured)} measurements in {self.seconds:.0f} s; all of it: --report FILE or --json",
+        ]
 
     def _best_of(self, cause: Cause) -> str:
         flagged = [one for one in self.findings if one.cause == cause]
@@ -106,6 +108,8 @@ class Report:
         return page_of(self).write(Path(path))
 
 
-def _wrapped(text: str, width: int, indent: int = 4) -> Sequence[str]:
-    lead = text[: len(text) - len(text.lstrip())]
-    return textwrap.wrap(text, width, initial_indent=lead, subsequent_indent=" " * indent) or [""]
+def _wrapped(text: str, most: int) -> list[str]:
+    """At most so many lines of 80."""
+    return textwrap.wrap(
+        text, 80, subsequent_indent="    ", max_lines=most, placeholder=" …", break_on_hyphens=False
+    ) or [""]  # fmt: skip

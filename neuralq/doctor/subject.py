@@ -36,6 +36,8 @@ class Settings:
         capacity: transitions that were stored at most.
         epsilon_start: exploration at the first step.
         epsilon_end: exploration at the end.
+        epsilon_decay_steps: environment steps over which it falls.
+        learning_starts: environment steps before the first update.
         reward_scale: by which rewards were multiplied for learning, values being divided by it again.
     """
 
@@ -51,6 +53,8 @@ class Settings:
     capacity: float | None = None
     epsilon_start: float | None = None
     epsilon_end: float | None = None
+    epsilon_decay_steps: float | None = None
+    learning_starts: float | None = None
     reward_scale: float | None = None
 
     @property
@@ -115,6 +119,7 @@ class Subject:
         first_action: the environment's name of action 0; None where the file does not say.
         num_actions: A; None where only a call tells.
         env: the environment that it was trained in, where the file names it.
+        replay: reads the experience that was stored with it, as the columns of ``data``; None where there is none.
     """
 
     origin: str
@@ -127,6 +132,7 @@ class Subject:
     first_action: int | None = None
     num_actions: int | None = None
     env: Any = None
+    replay: Callable[[], dict[str, Array] | None] | None = None
 
 
 def plain_outputs(network: nn.Module, x: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import FlattenObservation, TimeLimit
 
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.recipe.games import make_single, refusals_name
@@ -24,6 +25,7 @@ from neuralq.types import Array
 __all__ = ["World", "open_world"]
 
 _FOREVER = 10**9
+_COMPOSITE = (spaces.Dict, spaces.Tuple)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +37,12 @@ class World:
         make: makes one.
         num_actions: A.
         first_action: the environment's name of action 0.
-        observation_space: a Box or a Discrete space.
+        observation_space: a Box or a finite space; composite ones (Dict, Tuple) are flattened, as
+            `gymnasium.spaces.flatten` does it.
         limit: steps after which `TimeLimit` truncates; None without one.
         liftable: whether that limit can be lifted, so that episodes go on past it.
         model: the exact model; None where there is none.
-        command: how it is named at the command line.
+        named: how `neuralq train` is told of it, in words of a command line.
     """
 
     name: str
@@ -50,7 +53,7 @@ class World:
     limit: int | None
     liftable: bool
     model: FiniteMDP | None
-    command: str
+    named: tuple[str, ...]
 
     def lifted(self) -> gym.Env[Any, Any]:
         """One whose episodes go on past the limit."""
@@ -90,7 +93,7 @@ def open_world(env: Any) -> World:
             mapping of a run: ``env``, ``env_kwargs``, ``wrappers`` and ``frame_stack``.
 
     Raises:
-        ValueError: it cannot be made, its actions are not `Discrete`, or its observations are composite.
+        ValueError: it cannot be made, its actions are not `Discrete`, or its observations are of no known space.
 
     Example:
         >>> world = open_world("CartPole-v1")
@@ -104,7 +107,8 @@ def open_world(env: Any) -> World:
     def make() -> gym.Env[Any, Any]:
         with standing_in(handed.make), refusals_name(handed.env), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return wrapped(make_single(handed.env, handed.env_kwargs), *around)
+            made = wrapped(make_single(handed.env, handed.env_kwargs), *around)
+            return FlattenObservation(made) if isinstance(made.observation_space, _COMPOSITE) else made
 
     first = make()
     try:
@@ -112,18 +116,26 @@ def open_world(env: Any) -> World:
         space = first.observation_space
         if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
             raise ValueError(
-                f"observations must be of a Box or Discrete space, got {type(space).__name__}; wrap the environment "
-                f"with "
-                "gymnasium.wrappers.FlattenObservation"
+                f"observations must be of a Box, a finite or a composite space, got {type(space).__name__}; wrap the "
+                "environment with gymnasium.wrappers.TransformObservation"
             )
         found, spec = _limit_of(first), first.spec
         limit = found._max_episode_steps if found is not None else None if spec is None else spec.max_episode_steps
         return World(
             name=handed.env, make=make, num_actions=num_actions, first_action=first_action, observation_space=space,
-            limit=limit, liftable=found is not None, model=_model(env, first), command=f"--env {handed.env}",
+            limit=limit, liftable=found is not None, model=_model(env, first), named=_named(env, handed),
         )  # fmt: skip
     finally:
         first.close()
+
+
+def _named(env: Any, handed: Handed) -> tuple[str, ...]:
+    told: dict[str, Any] = {"env_kwargs": dict(handed.env_kwargs)}
+    if isinstance(env, Mapping):
+        told |= {"wrappers": list(env.get("wrappers") or ()), "frame_stack": env.get("frame_stack", 1)}
+    usual: dict[str, Any] = {"env_kwargs": {}, "wrappers": [], "frame_stack": 1}
+    changed = {name: value for name, value in told.items() if value != usual[name]}
+    return (handed.env, *(word for n, v in changed.items() for word in (f"--{n.replace('_', '-')}", json.dumps(v))))
 
 
 def _model(env: Any, made: gym.Env[Any, Any]) -> FiniteMDP | None:

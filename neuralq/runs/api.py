@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from neuralq.runs.control import CONTROL, Run, evaluate_run
 from neuralq.runs.evaluation import Evaluation
 from neuralq.runs.kinds import kind_of
@@ -115,9 +117,14 @@ def environment_of(run: Path, env: Any = None) -> Iterator[None]:
     make = _makers.get(run.resolve())
     if env is not None:
         handed = handed_over(env)
-        make = handed.make or functools.partial(make_single, handed.env, handed.env_kwargs)
+        make = handed.make or functools.partial(_by_name, handed.env, handed.env_kwargs)
     with standing_in(make):
         yield
+
+
+def _by_name(env: str, env_kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    with standing_in(None):  # which this stands in for
+        return make_single(env, env_kwargs)
 
 
 def folder_of(run: Any) -> Path:

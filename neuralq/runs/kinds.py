@@ -67,6 +67,7 @@ class CommandLine:
         measure: "module:function" of the command that evaluates such runs.
         measures: beginnings and endings of words that ask for that command where no run is named.
         instead: what to do where a command knows runs on environments only; ``{run}`` stands for the folder.
+        report: "module:function" that writes the page of a run folder and returns its path; None where there is none.
     """
 
     description: str
@@ -75,6 +76,7 @@ class CommandLine:
     measure: str
     measures: tuple[str, ...]
     instead: str
+    report: str | None = None
 
 
 @dataclass(frozen=True)

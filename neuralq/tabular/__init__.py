@@ -16,6 +16,8 @@ from neuralq.tabular.average import r_learning
 from neuralq.tabular.control import apply, double_q, expected_sarsa, q_learning, sarsa
 from neuralq.tabular.engine import RunOptions
 from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
+from neuralq.tabular.kernels.ase_ace import AseAce, AseAceRates, ase_ace_action, ase_ace_update, new_ase_ace
+from neuralq.tabular.kernels.random_numbers import new_stream
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
@@ -35,6 +37,8 @@ from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
 from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 
 __all__ = [
+    "AseAce",
+    "AseAceRates",
     "Band",
     "Curve",
     "EpsilonGreedy",
@@ -54,6 +58,8 @@ __all__ = [
     "apply_episodes",
     "apply_lambda",
     "apply_n_step",
+    "ase_ace_action",
+    "ase_ace_update",
     "batch_td",
     "compile_model",
     "double_q",
@@ -61,6 +67,8 @@ __all__ = [
     "episodic_q_learning",
     "expected_sarsa",
     "n_step",
+    "new_ase_ace",
+    "new_stream",
     "over_seeds",
     "predict",
     "prioritized_sweeping",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from neuralq.checks import check_choice
 
 if TYPE_CHECKING:
-    from neuralq.apps.pages.page import ChapterPage
+    from neuralq.runs.report.claims import ChapterPage
 
 __all__ = ["PAGES", "PageEntry", "run_page"]
 

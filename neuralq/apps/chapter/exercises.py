@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from neuralq.apps.chapter.figures import CELLS, all_policies
 from neuralq.apps.pages.grids import policy_grid, q_grid
-from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, number, own
 from neuralq.exact import evaluate, solve
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.report.claims import ChapterPage, Chart, Row, Series, claim, number, own
 from neuralq.tabular import Experience, apply
 from neuralq_envs import mitchell
 

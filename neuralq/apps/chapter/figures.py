@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.apps.pages.grids import policy_grid, q_grid, short
-from neuralq.apps.pages.page import ChapterPage, Row, claim, misprint, number, own
 from neuralq.exact import evaluate, optimal_policies, solve
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.report.claims import ChapterPage, Row, claim, misprint, number, own
 from neuralq.tabular import Experience, apply
 from neuralq_envs import mitchell
 

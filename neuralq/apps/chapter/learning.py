@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from neuralq.apps.chapter.figures import SIGNS
 from neuralq.apps.chapter.ordering import part_of
 from neuralq.apps.pages.grids import q_grid
-from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.exact import solve
 from neuralq.rules import k_to_the_q
+from neuralq.runs.report.claims import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.tabular import Band, Learned, RunOptions, apply, compile_model, over_seeds, q_learning, sweep_errors
 from neuralq.tabular.results import Experience
 from neuralq_envs import mitchell

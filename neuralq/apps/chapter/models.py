@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from neuralq.apps.chapter.ordering import path_to_end
 from neuralq.apps.pages.grids import policy_grid
-from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, number, own, spread
 from neuralq.exact import solve
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.report.claims import ChapterPage, Chart, Row, Series, claim, number, own, spread
 from neuralq.tabular import (
     Learned,
     Model,

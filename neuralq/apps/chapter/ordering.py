@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neuralq.apps.pages.grids import policy_grid
-from neuralq.apps.pages.page import ChapterPage, Chart, Series, claim, own, spread
 from neuralq.checks import check_fraction
 from neuralq.exact import solve
 from neuralq.mdp import FiniteMDP
 from neuralq.rules.shapes import check_actions, check_same_shape
 from neuralq.rules.targets import one_step
+from neuralq.runs.report.claims import ChapterPage, Chart, Series, claim, own, spread
 from neuralq.tabular import Experience, RunOptions, apply, compile_model, q_learning
 from neuralq_envs import dyna
 

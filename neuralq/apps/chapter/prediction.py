@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from neuralq.apps.chapter.ordering import part_of
-from neuralq.apps.pages.page import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.exact import evaluate, solve
 from neuralq.rules import lambda_returns
+from neuralq.runs.report.claims import ChapterPage, Chart, Row, Series, claim, misprint, number, own, spread
 from neuralq.tabular import Experience, RunOptions, batch_td, predict, td_lambda
 from neuralq.types import Floats
 from neuralq_envs import mitchell, random_walk

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.apps.pages.grids import short
-from neuralq.apps.pages.page import ChapterPage, GridDrawing, Row, Square, claim, number, own, spread
 from neuralq.exact import Solution, evaluate, solve
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.report.claims import ChapterPage, GridDrawing, Row, Square, claim, number, own, spread
 from neuralq.tabular import Band, EpsilonGreedy, Learned, RunOptions, compile_model, over_seeds, q_learning
 from neuralq_envs import tictactoe
 

@@ -72,7 +72,7 @@ COMMANDS = {
     "lab": _of("lab", "lab", "the divergence lab: diagnose, critical, prescribe, matrix, or --serve a page", _KNOW),
     "baird": _of("demo", "baird", "predict divergence on Baird's star, then measure it", _KNOW),
     "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),
-    "chapter": _of("chapter", "chapter", "run the figures and exercises of Mitchell's chapter 13", _EXACT),
+    "chapter": _of("chapter", "chapter", "run the figures, exercises and systems of Mitchell's chapter 13", _EXACT),
     "demo": _of("demo", "demo", "learn CartPole, predict a divergence, write a page about both", _PLAY),
     "play": _of("play", "play", "play backgammon against a trained agent, or tic-tac-toe, in the browser", _PLAY),
     "completion": _of("completion", "completion", "print a script that completes commands in your shell", _PLAY),

@@ -11,7 +11,6 @@ import numpy as np
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.option_values import ENV_KWARGS, reader
 from neuralq.apps.pages.grids import short
-from neuralq.apps.pages.page import Arrow, ChapterPage, GridDrawing, Square
 from neuralq.apps.pages.svg import page_svg
 from neuralq.apps.pages.text import ARROWS, drawing_lines
 from neuralq.exact import METHODS, Solution, count_optimal_policies
@@ -19,6 +18,7 @@ from neuralq.exact import solve as solve_mdp
 from neuralq.mdp import FiniteMDP
 from neuralq.mdp.grid import GridPlan, grid_plan
 from neuralq.runs.recipe.games import make_single, refusals_name
+from neuralq.runs.report.claims import Arrow, ChapterPage, GridDrawing, Square
 
 __all__ = ["solve"]
 

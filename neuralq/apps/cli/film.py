@@ -130,8 +130,10 @@ def caption(moment: Moment) -> str:
     return " · ".join([*parts, "the end" if moment.over else f"max Q {moment.value:.3g}"])
 
 
-def picture(frame: Any, text: str, width: int) -> Image:
+def picture(frame: Any, text: str | None, width: int) -> Image:
     """A frame ``[H, W, 3]`` at ``width`` pixels with a caption below; both sides are even, as video wants them.
+
+    Without a text there is no caption.
 
     Small pictures are enlarged by whole factors, so that the squares of a grid stay square and sharp.
 
@@ -152,6 +154,8 @@ def picture(frame: Any, text: str, width: int) -> Image:
         image = image.resize((image.width * factor, image.height * factor), Image.Resampling.NEAREST)
     elif image.width > width:
         image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+    if text is None:
+        return image
     size = max(10, min(18, image.width // 26))
     font = ImageFont.load_default(size=size)
     strip = size + 12

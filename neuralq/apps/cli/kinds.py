@@ -7,8 +7,9 @@ import contextlib
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_type_hints
 
@@ -16,8 +17,10 @@ from neuralq.apps.cli import Failure, print_result
 from neuralq.apps.cli.option_table import add_fields
 from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options, reader
 from neuralq.apps.cli.progress import training_bar
+from neuralq.checks import MissingExtra
 from neuralq.runs.folder.run_folder import claimed, read_config, refuse_old_run
 from neuralq.runs.kinds import KINDS, CommandLine, Kind, Result, kind_in, kind_named
+from neuralq.runs.report import write_report
 
 __all__ = ["changes_of", "conclude", "measured_by", "new_budget", "resume_kind", "say", "train_kind"]
 
@@ -39,6 +42,16 @@ def conclude(run: Result, as_json: bool, notes: Sequence[str] = (), **more: Any)
     return 0 if signal_name is None else 128 + signal.Signals[signal_name].value
 
 
+def reported(run: Result, film: Callable[[Path], Sequence[tuple[bytes, str]]] | None = None) -> str | None:
+    """The page of a run, written; None where there is nothing to draw with, which is said."""
+    folder = Path(run.plain()["run_dir"])
+    try:
+        return str(write_report(folder, () if film is None else film(folder)))
+    except MissingExtra as error:
+        say(f"no report: {error}")
+        return None
+
+
 def train_kind(name: str, argv: Sequence[str]) -> int:
     """Train as the options of this kind of run say."""
     kind = kind_named(name)
@@ -54,7 +67,7 @@ def train_kind(name: str, argv: Sequence[str]) -> int:
         say(f"run folder {path}; preparing (the first run on a machine compiles kernels)")
         with training_bar(kind, config) as bar:
             run = kind.train(config, path, [bar])
-    return conclude(run, as_json)
+    return conclude(run, as_json, report=reported(run) if _command(kind).report else None)
 
 
 def resume_kind(name: str, options: argparse.Namespace) -> int:
@@ -71,7 +84,7 @@ def resume_kind(name: str, options: argparse.Namespace) -> int:
         raise Failure(_in_options(kind, str(error)), 2) from error
     with training_bar(kind, config) as bar:
         run = kind.resume(options.run, budget, [bar], changes)
-    return conclude(run, options.json)
+    return conclude(run, options.json, report=reported(run) if _command(kind).report else None)
 
 
 def new_budget(kind: Kind[Any, Any, Any], options: argparse.Namespace) -> int | None:

@@ -12,12 +12,12 @@ from typing import Any
 
 from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.doctor import examined
-from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, resume_kind, say, train_kind
+from neuralq.apps.cli.filmstrip import filmstrip, filmstrip_unasked
+from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget, reported, resume_kind, say, train_kind
 from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
-from neuralq.checks import MissingExtra
 from neuralq.runs import Run, RunConfig, evaluate_run, load
 from neuralq.runs.changes import told
 from neuralq.runs.control import CONTROL, agent_of, last_cap
@@ -25,9 +25,16 @@ from neuralq.runs.estimate import estimate_policy
 from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.best import load_best
 from neuralq.runs.folder.checkpoint import CheckpointError
-from neuralq.runs.folder.run_folder import claimed, read_changes, read_config, read_metrics, refuse_old_run
+from neuralq.runs.folder.run_folder import (
+    claimed,
+    is_run_folder,
+    read_changes,
+    read_config,
+    read_metrics,
+    refuse_old_run,
+)
 from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
-from neuralq.runs.kinds import KINDS, kind_in
+from neuralq.runs.kinds import KINDS, kind_in, kind_named
 from neuralq.runs.loop import Hook
 from neuralq.runs.offline.files import read_recorded
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
@@ -208,21 +215,37 @@ def report(argv: list[str]) -> int:
         "report",
         "Write report.html into the folder of a run or of a sweep (extra plot).",
         "neuralq report runs/cart",
+        "neuralq report runs/cart --film",
         "neuralq report runs/cart-10-seeds",
     )
     parser.add_argument("run", help="folder of a run or of a sweep")
+    parser.add_argument(
+        "--film", action="store_true", default=None,
+        help="play an episode and show a few pictures of it; unasked for our own environments, which draw at once",
+    )  # fmt: skip
+    parser.add_argument("--no-film", action="store_false", dest="film", help="show no pictures")
+    add_trust(parser)
     options = parser.parse_args(argv)
-    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else write_report(single_run(options.run))
+    path = write_sweep_report(options.run) if is_sweep_folder(options.run) else _written(options)
     print_result({"report": str(path)}, options.json, [str(path)])
     return 0
 
 
+def _written(options: argparse.Namespace) -> Path:
+    """The page of one run, on an environment or of a kind with a page of its own."""
+    command = kind_named(name).command if (name := kind_in(options.run)) is not None else None
+    if command is not None and command.report is not None:
+        if options.film is not None:
+            raise Failure(f"--film is for runs on environments, and {options.run} is none; leave it out", 2)
+        return write_report(options.run)
+    path = single_run(options.run, options.trust)
+    if options.film is None:
+        return write_report(path, filmstrip_unasked(path) if is_run_folder(path) else ())
+    return write_report(path, filmstrip(path) if options.film else ())
+
+
 def _conclude(run: Run, as_json: bool, target: float | None, forced: bool) -> int:
-    try:
-        report_path = str(write_report(run.run_dir))
-    except MissingExtra as error:
-        report_path = None
-        say(f"no report: {error}")
+    report_path = reported(run, filmstrip_unasked)
     say(run.resumability)
     if run.engine != "compiled" and not forced:
         say(f"values and gradients were computed by {run.engine}: there are no kernels for all of this representation")

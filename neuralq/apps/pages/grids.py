@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neuralq.apps.pages.page import Arrow, GridDrawing, Square
+from neuralq.runs.report.claims import Arrow, GridDrawing, Square
 
 __all__ = ["best_actions", "policy_grid", "q_grid", "short"]
 

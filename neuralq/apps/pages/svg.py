@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable, Iterator
 from html import escape
 
-from neuralq.apps.pages.page import Arrow, ChapterPage, Chart, GridDrawing, Series, Square
 from neuralq.figures import COLOURS
+from neuralq.runs.report.claims import Arrow, ChapterPage, Chart, GridDrawing, Picture, Series, Square
 
 __all__ = ["page_svg"]
 
@@ -21,22 +21,23 @@ _STEPS = ((0, -1), (1, 0), (0, 1), (-1, 0))  # x and y of north, east, south, we
 
 
 def page_svg(page: ChapterPage) -> str:
-    """The drawings of a page, one below the other.
+    """The grids and charts of a page, one below the other.
 
     Raises:
-        ValueError: the page has no drawing.
+        ValueError: the page has none.
 
     Example:
-        >>> from neuralq.apps.pages.page import Square
+        >>> from neuralq.runs.report.claims import Square
         >>> page = ChapterPage("p", "a page", "13.2", (), (), (GridDrawing("one cell", 1, (Square("9"),)),))
         >>> page_svg(page).startswith("<svg")
         True
     """
-    if not page.drawings:
-        raise ValueError(f"the page {page.page!r} has no drawing")
+    drawings = [drawing for drawing in page.drawings if not isinstance(drawing, Picture)]
+    if not drawings:
+        raise ValueError(f"the page {page.page!r} has no grid or chart to draw")
     parts: list[str] = []
     top = float(_MARGIN)
-    for drawing in page.drawings:
+    for drawing in drawings:
         height, lines = _grid(drawing) if isinstance(drawing, GridDrawing) else _chart(drawing)
         heading = _text(_MARGIN, top + 16, drawing.title, size=15, anchor="start", weight="bold")
         parts.append(f'<g role="img"><title>{escape(drawing.title)}</title>{heading}')

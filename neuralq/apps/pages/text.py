@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from neuralq.apps.pages.page import Chart, Drawing, GridDrawing, Series, Square
+from neuralq.runs.report.claims import Chart, GridDrawing, Series, Square
 
 __all__ = ["ARROWS", "drawing_lines", "shown"]
 
@@ -23,7 +23,7 @@ def shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.6g}"
 
 
-def drawing_lines(drawing: Drawing) -> list[str]:
+def drawing_lines(drawing: GridDrawing | Chart) -> list[str]:
     r"""A grid as boxes, a chart as one row of bars per curve, under its title.
 
     Example:

@@ -13,9 +13,10 @@ import numpy as np
 
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.findings import Finding, Grade
+from neuralq.runs.offline.recorded import Recorded
 from neuralq.types import Array
 
-__all__ = ["actions_taken", "check_columns", "merged_ends", "reset_leak", "rewards_seen", "window"]
+__all__ = ["actions_taken", "check_columns", "merged_ends", "of_recorded", "reset_leak", "rewards_seen", "window"]
 
 COLUMNS = ("obs", "action", "reward", "terminated", "truncated", "next_obs")
 
@@ -44,6 +45,14 @@ def check_columns(stored: Mapping[str, Array]) -> dict[str, Array]:
         found[name] = found[name].reshape(num)
     order = np.argsort(np.asarray(stored["age"]).reshape(num))[::-1] if "age" in stored else np.arange(num)
     return {name: column[order] for name, column in found.items()}
+
+
+def of_recorded(given: Recorded) -> dict[str, Array]:
+    """The columns of a record, without the steps of which nobody knows what came next."""
+    columns = (
+        given.observations, given.actions, given.rewards, given.terminations, given.truncations, given.successors
+    )  # fmt: skip
+    return {name: column[given.known] for name, column in zip(COLUMNS, columns, strict=True)}
 
 
 def _stored(case: Case) -> Mapping[str, Array]:

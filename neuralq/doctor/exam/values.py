@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from neuralq.doctor.estimates import bounds_of, rank_correlation
 from neuralq.doctor.exam.case import CannotMeasure, Case, stacked
+from neuralq.doctor.exam.retraining import further_reach, in_words, retrained
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Episode, horizon, returns_from
+from neuralq.doctor.play import Episode, returns_from
 from neuralq.types import Array, Floats
 
 __all__ = ["better_actions", "bias", "generalisation", "has_learned", "rank", "reach", "soft_divergence"]
@@ -143,26 +145,29 @@ def reach(case: Case) -> Finding:
         f"steady "
         f"stream is worth at γ = {case.gamma:g}"
     )
-    updates = case.settings.updates or 1.0
-    wanted = max(int(updates / max(3 * horizon(min(case.gamma, 0.9999), 0.05), 1)), 1)
+    changes = further_reach(case)
     return Finding(
         "V5", "values cannot see far enough: the target network was copied too seldom", "algorithm", "B", value, None,
         0.9,
         "our own; ρ = 1 − γ^(nK) was measured as predicted", value < 0.9, said,
-        f"copy the target network every {wanted:,} updates or sooner, or use n-step targets or λ-returns",
-        _faster_copies(case),
+        f"{in_words(changes)}; or λ-returns", _confirming_reach(case, changes),
     )  # fmt: skip
 
 
-def _faster_copies(case: Case) -> str:
-    """Targets that look further ahead, so that copies need not come so often that the updates chase themselves."""
-    ours = f"neuralq train {case.world.name}  # λ-returns, which carry rewards further at once"
-    if case.subject.origin.startswith(("DQN of Stable-Baselines3", "QR-DQN")):
-        interval = max(int(3 * (case.settings.env_steps or 50_000) / min(case.horizon, 10**6)), 1)
-        return (
-            f"DQN('MlpPolicy', env, n_steps=5, target_update_interval={interval}, ...)  # as many steps again\n{ours}"
-        )
-    return ours
+def _confirming_reach(case: Case, changes: Mapping[str, Any]) -> str:
+    """Training again with these changes and everything else as it was, by whoever trained it and by a learner here."""
+    known, ours = case.settings, retrained(case, changes)
+    if not case.subject.origin.startswith("DQN of Stable-Baselines3"):
+        return ours
+    steps, updates = known.env_steps or 50_000, known.updates or 1.0
+    told = {
+        "n_steps": changes["num_steps"],
+        "target_update_interval": round(changes["target_period_updates"] * steps / updates),
+        **({"learning_rate": changes["learning_rate"]} if "learning_rate" in changes else {}),
+    }
+    said = ", ".join(f"{name}={value:g}" for name, value in told.items())
+    total = changes.get("total_steps", int(steps))
+    return f"DQN('MlpPolicy', env, {said}).learn({total})  # the rest as it was\n{ours}"
 
 
 def rank(case: Case) -> Finding:

@@ -17,7 +17,7 @@ from neuralq.doctor.weights import CannotLoad, plain_bytes, read_state
 __all__ = ["CLEANRL", "of_state"]
 
 
-def _load(path: Path, net: str | None) -> Subject:
+def _load(path: Path, net: str | None, env: Any) -> Subject:
     if net is not None:
         raise CannotLoad(f"{path} is a model of CleanRL, whose network follows from its weights; leave --net out")
     return of_state(read_state(plain_bytes(path), str(path)), path)
@@ -67,11 +67,13 @@ def _settings(given: Mapping[Any, Any]) -> Settings:
     steps, every = number("total_timesteps"), number("train_frequency")
     updates = None if not steps or not every else max(steps - (number("learning_starts") or 0.0), 0.0) / every
     interval = number("target_network_frequency")  # in environment steps
+    share = number("exploration_fraction")
     return Settings(
         gamma=number("gamma"), learning_rate=number("learning_rate"), tau=number("tau"), num_steps=1.0, lambda_=0.0,
         target_period_updates=None if interval is None or not every else max(interval / every, 1e-9), updates=updates,
         env_steps=steps, batch_size=number("batch_size"), capacity=number("buffer_size"),
         epsilon_start=number("start_e"), epsilon_end=number("end_e"),
+        epsilon_decay_steps=share * steps if share and steps else None, learning_starts=number("learning_starts"),
     )  # fmt: skip
 
 

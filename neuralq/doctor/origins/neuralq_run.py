@@ -2,43 +2,43 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuralq.doctor.origins.record import Origin
+from neuralq.doctor.origins.stored_replay import rescaled, stored_replay
 from neuralq.doctor.subject import Settings, Subject, of_network
 from neuralq.doctor.weights import CannotLoad
 from neuralq.runs import load
 from neuralq.runs.agent import Agent
 from neuralq.runs.folder.run_folder import is_run_folder, read_config, read_metrics
 from neuralq.runs.recipe.config import RunConfig, config_from_dict
+from neuralq.runs.recipe.stand_in import nameless
 from neuralq.types import Array
 
-__all__ = ["NEURALQ_RUN"]
+__all__ = ["NEURALQ_RUN", "of_agent"]
 
 
-def _load(path: Path, net: str | None) -> Subject:
+def _load(path: Path, net: str | None, env: Any) -> Subject:
     if net is not None:
         raise CannotLoad(f"{path} is a run folder, which says itself what its network is; leave --net out")
     try:
-        agent = load(path)
+        agent = load(path, env=env if nameless(str(read_config(path).get("env"))) else None)
     except (RuntimeError, ValueError) as error:
         raise CannotLoad(f"cannot load the run {path}: {error}") from error
     if not isinstance(agent, Agent):
         raise CannotLoad(f"{path} is a run of {type(agent).__name__}, whose moves are no actions of an environment")
-    config = config_from_dict(read_config(path))
-    env = {
-        "env": config.env, "env_kwargs": dict(config.env_kwargs), "wrappers": config.wrappers,
-        "frame_stack": config.frame_stack,
-    }  # fmt: skip
-    return of_agent(agent, f"neuralq run {path}", _settings(config, path, agent.reward_scale), env)
+    return of_agent(agent)
 
 
-def of_agent(agent: Agent, origin: str, settings: Settings, env: object = None) -> Subject:
-    """The subject that an agent of neuralq is.
+def of_agent(agent: Agent) -> Subject:
+    """The subject that an agent of neuralq is, with what the folder of its run says.
 
     Raises:
         CannotLoad: its observations carry an action mask.
@@ -47,7 +47,8 @@ def of_agent(agent: Agent, origin: str, settings: Settings, env: object = None) 
         raise CannotLoad("agents whose observations carry an action mask are not examined yet")
 
     def encode(observations: Array) -> Tensor:
-        encoded = np.asarray(agent.encoder.encode(observations))
+        composite = bool(agent.encoder.parts[0].keys)  # which come flat
+        encoded = rescaled(agent, observations) if composite else np.asarray(agent.encoder.encode(observations))
         if agent.normalisation is not None:
             encoded = agent.normalisation.observe(encoded)
         return torch.from_numpy(encoded)
@@ -57,10 +58,21 @@ def of_agent(agent: Agent, origin: str, settings: Settings, env: object = None) 
         return given
 
     assert isinstance(agent.q, nn.Module)
-    return of_network(
-        agent.q, origin, encode=encode, outputs=outputs, settings=settings, num_actions=agent.spec.num_actions,
-        first_action=agent.first_action, env=env,
+    told: dict[str, Any] = {"settings": Settings(reward_scale=agent.reward_scale)}
+    origin, path, replay = "an agent of neuralq", agent.run_dir, None
+    if path is not None and is_run_folder(path):
+        config, origin = config_from_dict(read_config(path)), f"neuralq run {path}"
+        named = {name: getattr(config, name) for name in ("env", "env_kwargs", "wrappers", "frame_stack")}
+        told = {
+            "settings": _settings(config, path, agent.reward_scale),
+            "env": None if nameless(config.env) else named,
+        }
+        replay = functools.partial(stored_replay, path, agent, config.gamma)
+    subject = of_network(
+        agent.q, origin, encode=encode, outputs=outputs, num_actions=agent.spec.num_actions,
+        first_action=agent.first_action, **told,
     )  # fmt: skip
+    return replace(subject, replay=replay)
 
 
 def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
@@ -72,7 +84,7 @@ def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
     per_step = getattr(own, "updates_per_period", 1) / getattr(own, "train_period", 1)
     learned = None if env_steps is None else max(env_steps - getattr(own, "learning_starts", 0), 0)
     updates = float(max(seen)) if seen else None if learned is None else learned * per_step
-    capacity, batch = getattr(own, "capacity", None), getattr(own, "batch_size", None)
+    capacity, batch, starts = (getattr(own, name, None) for name in ("capacity", "batch_size", "learning_starts"))
     return Settings(
         gamma=config.gamma,
         learning_rate=traits.step_size,
@@ -85,6 +97,8 @@ def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
         capacity=None if capacity is None else float(capacity),
         epsilon_start=config.epsilon_start,
         epsilon_end=config.epsilon_end,
+        epsilon_decay_steps=float(config.epsilon_decay_steps),
+        learning_starts=None if starts is None else float(starts),
         reward_scale=reward_scale,
     )
 

@@ -39,7 +39,7 @@ def _recognises(path: Path) -> bool:
         return False
 
 
-def _load(path: Path, net: str | None) -> Subject:
+def _load(path: Path, net: str | None, env: Any) -> Subject:
     if net is not None:
         raise CannotLoad(f"{path} says itself what its network is; leave --net out")
     members = read_members(plain_bytes(path), lambda name: name in _READ, str(path))
@@ -154,7 +154,7 @@ def _settings(told: Mapping[str, Any], optimiser: bytes | None, what: str) -> Se
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
     steps, updates, interval = number("num_timesteps"), number("_n_updates"), number("target_update_interval")
-    starts = number("learning_starts") or 0.0
+    starts, share = number("learning_starts") or 0.0, number("exploration_fraction")
     period = None
     if steps and updates and interval:  # counted in environment steps
         at_once = number("gradient_steps") or 1.0  # updates between which nothing is copied
@@ -164,6 +164,7 @@ def _settings(told: Mapping[str, Any], optimiser: bytes | None, what: str) -> Se
         num_steps=number("n_steps") or 1.0, lambda_=0.0, target_period_updates=period, updates=updates, env_steps=steps,
         batch_size=number("batch_size"), capacity=number("buffer_size"),
         epsilon_start=number("exploration_initial_eps"), epsilon_end=number("exploration_final_eps"),
+        epsilon_decay_steps=share * steps if share and steps else None, learning_starts=number("learning_starts"),
     )  # fmt: skip
 
 

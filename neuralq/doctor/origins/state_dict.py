@@ -22,7 +22,7 @@ __all__ = ["STATE_DICT"]
 _SUFFIXES = (".pth", ".pt", ".bin", ".ckpt", ".safetensors", ".npz")
 
 
-def _load(path: Path, net: str | None) -> Subject:
+def _load(path: Path, net: str | None, env: Any) -> Subject:
     raw, what = plain_bytes(path), str(path)
     state: Mapping[Any, Any]
     if path.suffix == ".safetensors":

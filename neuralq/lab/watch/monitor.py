@@ -406,10 +406,12 @@ class DivergenceMonitor:
         """What was seen and what to change, in a paragraph or two."""
         parts = [f"{self._env_steps:,} steps watched: " + ("no alarm." if not self.alarms else "")]
         parts += [f"[{alarm.kind}, at {alarm.env_steps:,} steps] {alarm.message}" for alarm in self.alarms]
-        if not self.alarms and self.bound is not None:
+        if not self.alarms and self._largest_value:
+            bound = self.bound
+            most = "" if bound is None else f"; by the rewards of the same steps no return exceeds {bound:.4g}"
             parts.append(
                 f"The largest |Q(s, a)| of the updates looked at, one before each row of metrics, was "
-                f"{self._largest_value:.4g}; by the rewards of the same steps no return exceeds {self.bound:.4g}."
+                f"{self._largest_value:.4g}{most}."
             )
         if self.diagnoses and not any(alarm.kind == "kernel" for alarm in self.alarms):
             parts.append(self.diagnoses[-1][1].explain())

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neuralq.figures import COLOURS, MARKERS, draw_png, draw_svg, steps_axis, tame
+from neuralq.figures import COLOURS, MARKERS, band, draw_png, draw_svg, steps_axis, tame
 from neuralq.runs.folder.files import as_float
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_config, read_metrics, read_seed
 from neuralq.runs.play_off import Score, score_of
@@ -24,7 +24,7 @@ from neuralq.types import Floats
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Group", "GroupCurve", "comparison_png", "comparison_svg", "group_curve", "read_groups"]
+__all__ = ["Group", "GroupCurve", "algorithm_in", "comparison_png", "comparison_svg", "group_curve", "read_groups"]
 
 _MOST_POINTS = 120
 _CURVE_RESAMPLES = 1_000
@@ -144,6 +144,8 @@ def _named(found: Sequence[tuple[str, dict[str, Any], tuple[SeedRun, ...]]]) -> 
         if [other for other, _, _ in found].count(name) > 1:
             name = str(runs[0].path)
         groups.append(Group(name, _label(own), own, runs))
+    if len(groups) == 1:
+        return [dataclasses.replace(groups[0], label=algorithm_in(found[0][1]) or groups[0].name)]
     labels = [group.label for group in groups]
     # A label that is empty, long or not the only one of its kind gives way to the name.
     return [
@@ -151,6 +153,24 @@ def _named(found: Sequence[tuple[str, dict[str, Any], tuple[SeedRun, ...]]]) -> 
         else dataclasses.replace(group, label=group.name)
         for group in groups
     ]  # fmt: skip
+
+
+def algorithm_in(settings: Mapping[str, Any]) -> str:
+    """What learns, in words, by the names of a flat configuration; "" where it does not say.
+
+    Example:
+        >>> algorithm_in({"learner": "tabular", "tabular.algorithm": "q-learning", "layout": "table"})
+        'tabular q-learning'
+        >>> algorithm_in({"learner": "rollout", "layout": "separate"})
+        'rollout, layout separate'
+    """
+    learner = settings.get("learner")
+    if not isinstance(learner, str):
+        return ""
+    own = [settings.get(f"{learner}.{name}") for name in ("algorithm", "target_rule")]
+    named = " ".join([learner, *(one for one in own if isinstance(one, str))])
+    layout = settings.get("layout")
+    return f"{named}, layout {layout}" if isinstance(layout, str) and layout != "table" else named
 
 
 def _run_folders(path: Path) -> list[Path]:
@@ -231,9 +251,9 @@ def _paint(figure: Figure, groups: Sequence[Group]) -> None:
     for number, group in enumerate(groups):
         curve = group_curve(group)
         colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        seeds = f" ({len(group.runs)} seeds)" if len(group.runs) > 1 else ""
+        seeds = f" ({len(group.runs)} seeds)" if len(group.runs) > 1 else f" (seed {group.runs[0].seed})"
         if curve.low is not None and curve.high is not None:
-            axes.fill_between(curve.steps, tame(curve.low), tame(curve.high), color=colour, alpha=0.18, linewidth=0)
+            band(axes, curve.steps, curve.low, curve.high, colour)
         every = max(1, len(curve.steps) // 12)
         axes.plot(curve.steps, tame(curve.iqm), color=colour, marker=marker, markevery=every, label=group.label + seeds)
     steps_axis(axes, "environment steps")

@@ -18,7 +18,7 @@ from neuralq.runs.play_off import about, score_of
 from neuralq.runs.report.page import html_table, short_number
 from neuralq.runs.report.readings import Row, finite_series, rows_by_step
 
-__all__ = ["exact_table", "kept_words", "network_table", "play_off_words", "tiles_of", "watched_words"]
+__all__ = ["exact_table", "kept_words", "network_table", "play_off_words", "sentence", "tiles_of", "watched_words"]
 
 Tile = tuple[str, str, str]
 

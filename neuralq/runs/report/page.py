@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,8 +48,12 @@ p { margin: .6rem 0; max-width: 40rem; overflow-wrap: anywhere; }
 figure { margin: 1rem 0; }
 figcaption { color: var(--soft); font-size: .92rem; }
 svg.figure { display: block; width: 100%; height: auto; }
+.film { display: grid; grid-template-columns: repeat(auto-fill, minmax(9rem, 1fr)); gap: .5rem; }
+.film img { display: block; width: 100%; height: auto; border: 1px solid var(--line); border-radius: 4px; }
+.film small { color: var(--soft); }
 .scroll { overflow-x: auto; margin: .3rem 0 .8rem; }
 table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
+.scroll th[scope="row"] { min-width: 4.5rem; }
 .caption { color: var(--soft); font-size: .92rem; margin-bottom: 0; }
 th, td { text-align: left; vertical-align: top; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); }
 th { font-weight: 600; }
@@ -81,6 +86,7 @@ class Page:
     lead: str = ""
     style: str = ""
     _body: list[str] = field(default_factory=list)
+    _has_pictures: bool = False
 
     def heading(self, text: str) -> None:
         """A section's heading."""
@@ -96,6 +102,18 @@ class Page:
             f'<figure>\n<div class="scroll">{svg}</div>\n<figcaption>{escape(caption)}</figcaption>\n</figure>'
         )
 
+    def film(self, pictures: Sequence[tuple[bytes, str]], caption: str) -> None:
+        """Pictures side by side, PNG files that stand in the page itself, each with its words."""
+        self._has_pictures = True
+        each = "\n".join(
+            f'<div><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{escape(words, quote=True)}">'
+            f"<small>{escape(words)}</small></div>"
+            for png, words in pictures
+        )
+        self._body.append(
+            f'<figure>\n<div class="film">{each}</div>\n<figcaption>{escape(caption)}</figcaption>\n</figure>'
+        )
+
     def table(self, table: str) -> None:
         """A table made by `html_table` or `facts_table`."""
         self._body.append(table)
@@ -108,11 +126,12 @@ class Page:
         """The whole document."""
         lead = f'\n<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
         body = "\n".join(self._body)
+        pictures = "; img-src data:" if self._has_pictures else ""
         return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'{pictures}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(self.title)}</title>
 <style>{_STYLE}{self.style}</style>

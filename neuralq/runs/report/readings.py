@@ -9,10 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from neuralq.runs.changes import told
 from neuralq.runs.folder.files import as_float, read_json
+from neuralq.runs.folder.run_folder import read_changes
 from neuralq.types import Floats
 
-__all__ = ["Row", "finite_series", "first_not_finite", "quartiles", "read_present_summary", "standard_errors", "thin"]
+__all__ = [
+    "Row",
+    "finite_series",
+    "first_not_finite",
+    "quartiles",
+    "read_present_summary",
+    "read_told_changes",
+    "standard_errors",
+    "thin",
+]
 
 Row = Mapping[str, Any]
 
@@ -27,6 +38,17 @@ def read_present_summary(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:
     summary = read_json(file) if file.exists() else {}
     at = as_float(summary.get("env_steps"))
     return {} if any(as_float(row.get("env_steps")) > at for row in rows) else summary
+
+
+def read_told_changes(folder: Path) -> list[tuple[float, str]]:
+    """When a run went on otherwise than before, in environment steps, and with what; what is damaged is left out."""
+    found = []
+    for row in read_changes(folder):
+        changes = row.get("changes")
+        both = changes.items() if isinstance(changes, Mapping) else ()
+        if pairs := {str(name): pair for name, pair in both if isinstance(pair, list) and len(pair) == 2}:
+            found.append((float(row["env_steps"]), told({**row, "changes": pairs})))
+    return found
 
 
 def rows_by_step(rows: Iterable[Row], kind: str) -> list[tuple[float, Row]]:

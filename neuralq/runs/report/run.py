@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,11 +13,20 @@ from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.files import as_float, read_json, read_rows
 from neuralq.runs.folder.run_folder import warn_of_lost_rows
 from neuralq.runs.held import DRAWING_NAME
+from neuralq.runs.kinds import KINDS, kind_in, kind_named
 from neuralq.runs.report.curves import SIGNALS, curve_words, learning_curve_svg, signals_svg
 from neuralq.runs.report.grid import grid_svg
-from neuralq.runs.report.outcome import exact_table, kept_words, network_table, play_off_words, tiles_of, watched_words
+from neuralq.runs.report.outcome import (
+    exact_table,
+    kept_words,
+    network_table,
+    play_off_words,
+    sentence,
+    tiles_of,
+    watched_words,
+)
 from neuralq.runs.report.page import Page, facts_table, flatten, tiles
-from neuralq.runs.report.readings import Row, finite_series, first_not_finite, read_present_summary
+from neuralq.runs.report.readings import Row, finite_series, first_not_finite, read_present_summary, read_told_changes
 
 __all__ = ["write_report"]
 
@@ -25,10 +35,15 @@ _TARGET_KEYS = ("stop_at_return", "target_return")
 _NAME_KEYS = ("env_id", "environment", "env")
 
 
-def write_report(run_dir: str | Path) -> Path:
+def write_report(run_dir: str | Path, film: Sequence[tuple[bytes, str]] = ()) -> Path:
     """Writes ``report.html`` into a run folder and returns its path; may be called while the run goes on.
 
-    Reads ``metrics.jsonl``, ``config.json``, ``versions.json`` and ``summary.json``; each may still be missing.
+    A run of a kind with a page of its own gets that. Reads ``metrics.jsonl``, ``config.json``, ``versions.json`` and
+    ``summary.json``; each may still be missing.
+
+    Args:
+        run_dir: the folder.
+        film: pictures of an episode, each the bytes of a PNG file and words on it, to be shown in the page.
 
     Raises:
         FileNotFoundError: the folder holds none of them.
@@ -45,6 +60,11 @@ def write_report(run_dir: str | Path) -> Path:
     folder = Path(run_dir)
     if not any((folder / file).exists() for file in _FILES):
         raise FileNotFoundError(f"{folder} is no run folder: it holds none of {', '.join(_FILES)}; pass one that does")
+    command = kind_named(name).command if (name := kind_in(folder)) in KINDS else None
+    if command is not None and command.report is not None:
+        module, _, function = command.report.partition(":")
+        path: Path = getattr(importlib.import_module(module), function)(folder)
+        return path
     rows = read_rows(folder / "metrics.jsonl")
     files = (folder / f"{name}.json" for name in ("config", "versions"))
     config, versions = (read_json(file) if file.exists() else {} for file in files)
@@ -52,11 +72,18 @@ def write_report(run_dir: str | Path) -> Path:
     warn_of_lost_rows(folder, len(rows), summary.pop("num_rows", None))
     target = _first_number(config, _TARGET_KEYS)
     page = Page(_title(config, folder), lead=_lead(rows, summary, target))
-    _outcome(page, folder, rows, summary, target)
+    _outcome(page, folder, rows, summary, config)
+    if film:
+        page.heading("A greedy episode")
+        page.film(film, "One episode without exploration (seed 0), at even intervals.")
+    changes = read_told_changes(folder)
+    changed_at = [at for at, _ in changes]
     page.heading("Learning curve")
-    page.figure(learning_curve_svg(rows, target), curve_words(rows))
-    _soundness(page, rows, summary)
+    page.figure(learning_curve_svg(rows, target, changed_at=changed_at), curve_words(rows))
+    _soundness(page, rows, summary, changed_at)
     page.heading("How it was made")
+    for _, words in changes:
+        page.paragraph(sentence(words))
     if (network := network_table(_layers(folder))) is not None:
         page.folded(f"What was learned: {network[0]}", network[1])
     page.folded("Everything that was recorded", facts_table(_facts(rows, summary)))
@@ -65,8 +92,11 @@ def write_report(run_dir: str | Path) -> Path:
     return page.write(folder / "report.html")
 
 
-def _outcome(page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str, Any], target: float | None) -> None:
+def _outcome(
+    page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str, Any], config: Mapping[str, Any]
+) -> None:
     """How well it plays, and the exact answer beside it."""
+    target = _first_number(config, _TARGET_KEYS)
     if found := tiles_of(rows, summary, target):
         page.table(tiles(found))
     if (decided := play_off_words(summary)) is not None:
@@ -74,7 +104,12 @@ def _outcome(page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str
     if (beside := exact_table(summary)) is None:
         return
     page.heading("Beside the exact answer")
-    page.paragraph(beside[0])
+    gamma = as_float(config.get("gamma"))
+    known = f" = {gamma:g}" if math.isfinite(gamma) else ""
+    page.paragraph(
+        f"{beside[0]} Q* and V* are those of the environment's model with the run's γ{known}, in the environment's "
+        "units; numbers have four digits, those in cells of the map three."
+    )
     page.table(beside[1])
     path = folder / DRAWING_NAME
     drawn = grid_svg(read_json(path)) if path.exists() else None
@@ -82,7 +117,7 @@ def _outcome(page: Page, folder: Path, rows: Sequence[Row], summary: Mapping[str
         page.figure(*drawn)
 
 
-def _soundness(page: Page, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
+def _soundness(page: Page, rows: Sequence[Row], summary: Mapping[str, Any], changed_at: Sequence[float]) -> None:
     """Whether learning diverged: the monitor's word, and the signals."""
     page.heading("Is learning sound?")
     if (watched := watched_words(summary)) is not None:
@@ -95,7 +130,7 @@ def _soundness(page: Page, rows: Sequence[Row], summary: Mapping[str, Any]) -> N
                 "The signals below show how it grew before.",
                 warning=True,
             )
-    signals = signals_svg(rows)
+    signals = signals_svg(rows, changed_at=changed_at)
     if signals is None:
         page.paragraph("No TD error, Q value or loss was recorded yet.")
         return

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
+from typing import Any
 
+from neuralq.runs.folder.files import as_float
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.play_off import Score
-from neuralq.runs.report.comparison import Group, comparison_svg, read_groups
-from neuralq.runs.report.page import Page, short_number, tiles
+from neuralq.runs.report.comparison import Group, algorithm_in, comparison_svg, read_groups
+from neuralq.runs.report.outcome import sentence
+from neuralq.runs.report.page import Page, flatten, short_number, tiles
 
 __all__ = ["write_sweep_report"]
 
@@ -23,9 +28,10 @@ def write_sweep_report(sweep_dir: str | Path) -> Path:
     """
     folder = Path(sweep_dir)
     groups, left_out = read_groups([folder])
-    env = str(read_config(groups[0].runs[0].path).get("env") or folder.resolve().name)
+    config = read_config(groups[0].runs[0].path)
+    env = str(config.get("env") or folder.resolve().name)
     count = sum(len(group.runs) for group in groups)
-    page = Page(f"{env}: {count} seeds", lead="Each seed is a run of its own; none was chosen.")
+    page = Page(f"{env}: {count} seeds", lead=_lead(config))
     for group in groups:
         page.table(tiles(_tiles(group)))
     for line in left_out:
@@ -39,6 +45,13 @@ def write_sweep_report(sweep_dir: str | Path) -> Path:
     for group in groups:
         page.table(_seeds(group, folder))
     return page.write(folder / "report.html")
+
+
+def _lead(config: Mapping[str, Any]) -> str:
+    gamma, learns = as_float(config.get("gamma")), algorithm_in(dict(flatten(config)))
+    parts = [*([learns] if learns else []), *([f"γ = {gamma:g}"] if math.isfinite(gamma) else [])]
+    told = f" {sentence(', '.join(parts))}" if parts else ""
+    return f"Each seed is a run of its own; none was chosen.{told} Numbers have four digits."
 
 
 def _tiles(group: Group) -> list[tuple[str, str, str]]:

@@ -15,12 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 from numpy.typing import ArrayLike
 
 from neuralq.checks import check_fraction, check_whole
 from neuralq.types import Floats
 
-__all__ = ["Estimate", "bootstrap_interval", "estimate", "interquartile_mean"]
+__all__ = ["Estimate", "bootstrap_interval", "estimate", "interquartile_mean", "median_interval"]
 
 _MOST_DRAWN = 4_000_000  # scores held at once while resampling: 32 MB
 
@@ -134,3 +135,35 @@ def estimate(scores: ArrayLike, seed: int = 0) -> Estimate:
         return Estimate(iqm, None, None, len(values))
     low, high = bootstrap_interval(values, np.random.default_rng(seed))
     return Estimate(iqm, float(low), float(high), len(values))
+
+
+def median_interval(scores: ArrayLike, confidence: float = 0.95) -> tuple[float, float] | None:
+    """The two scores between which the true median lies with at least this confidence, whatever the distribution.
+
+    Of n scores the number below the median is binomial, so the k-th from either end will do where k − 1 or fewer
+    successes of n fair throws have a probability of at most (1 − confidence) / 2. Scores that are only known to be
+    large ("not within 1,000") may stand as the bound.
+
+    Args:
+        scores: ``[n]``.
+        confidence: in [0, 1].
+
+    Returns:
+        Lower and upper bound; None where n is too small for any (below six for 95 %).
+
+    Raises:
+        ValueError: if there are no scores, or for a confidence outside [0, 1].
+
+    Source: David & Nagaraja 2003, "Order statistics", section 7.1.
+
+    Example:
+        >>> median_interval([9.0, 1.0, 2.0, 3.0, 4.0, 5.0]), median_interval([1.0, 2.0])
+        ((1.0, 9.0), None)
+    """
+    check_fraction("confidence", confidence)
+    ordered = np.sort(np.asarray(scores, np.float64).reshape(-1))
+    if not ordered.size:
+        raise ValueError("an interval needs at least one score, got none")
+    at_most = scipy.stats.binom.cdf(np.arange(ordered.size // 2), ordered.size, 0.5)
+    k = int(np.count_nonzero(at_most <= (1.0 - confidence) / 2))
+    return (float(ordered[k - 1]), float(ordered[-k])) if k else None

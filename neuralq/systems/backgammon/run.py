@@ -257,6 +257,7 @@ TD_GAMMON = Kind(
         },
         measure="neuralq.apps.cli.backgammon_match:evaluate_backgammon",
         measures=("--against", "--error-rate", ".safetensors"),
+        report="neuralq.apps.pages.gammon:write_gammon_report",
         instead="measured by `neuralq evaluate {run} --against pubeval` and played by `neuralq play backgammon "
         "--agent {run}`",
     ),

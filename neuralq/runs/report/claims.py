@@ -1,19 +1,20 @@
 """What a page of the chapter found: numbers beside the printed ones, drawings and a short explanation.
 
-A page is a function without required arguments that returns a `ChapterPage`. It prints nothing;
-`neuralq.apps.pages.text` and `neuralq.apps.pages.svg` show it, and tests read its numbers.
+Whoever finds something returns a `ChapterPage` and prints nothing; `neuralq.apps.pages` shows it as text, as SVG and as
+HTML, and tests read its numbers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neuralq.runs.sweep.statistics import median_interval
 from neuralq.types import Array
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "Chart",
     "Drawing",
     "GridDrawing",
+    "Measured",
+    "Picture",
     "Row",
     "Series",
     "Square",
@@ -29,10 +32,12 @@ __all__ = [
     "misprint",
     "number",
     "own",
+    "published",
     "spread",
 ]
 
 AGREES, DIFFERS, MISPRINT, OURS = "agrees", "differs", "misprint", "ours"
+NOT_REPRODUCED = "not reproduced"
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,8 @@ class Row:
         what: its name.
         book: what was printed, or what a theorem demands; empty where there is nothing to compare with.
         ours: what was computed.
-        verdict: ``"agrees"``, ``"differs"``, ``"misprint"`` (ours is right, as the note explains) or ``"ours"``.
+        verdict: ``"agrees"``, ``"differs"``, ``"misprint"`` (ours is right, as the note explains), ``"ours"``, or
+            ``"not reproduced"`` (an experiment that somebody published came out otherwise here).
         note: one line for the reader.
     """
 
@@ -111,7 +117,77 @@ class Chart:
         return math.log10(max(y, 1e-12)) if self.log_y else y
 
 
-Drawing = GridDrawing | Chart
+@dataclass(frozen=True)
+class Picture:
+    """A finished SVG element, with what is to be seen in it; for HTML only.
+
+    Args:
+        title: of the picture.
+        svg: the element; it may stand in more than that, such as a button that stops it.
+        caption: what is to be seen.
+    """
+
+    title: str
+    svg: str
+    caption: str
+
+
+Drawing = GridDrawing | Chart | Picture
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A quantity measured with several seeds.
+
+    Args:
+        what: its name and unit.
+        values: one for each seed.
+        limit: where measuring stopped: a value of that is one of at least that; None where there is no limit.
+    """
+
+    what: str
+    values: tuple[float, ...]
+    limit: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", tuple(map(float, self.values)))
+
+    @property
+    def median(self) -> float:
+        """Of the seeds."""
+        return float(np.median(self.values))
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """What the true median lies in with 95 %; None for fewer than six seeds."""
+        return median_interval(self.values)
+
+    def __str__(self) -> str:
+        """Median and interval; of few seeds, median and range.
+
+        Example:
+            >>> str(Measured("steps", (1, 2, 3, 4, 5, 6, 40), limit=40)), str(Measured("steps", (1, 2, 4)))
+            ('4 [1, over 40]', '2 (3 seeds: 1 to 4)')
+        """
+        low, high = map(self._said, self.interval or (min(self.values), max(self.values)))
+        middle = self._said(self.median)
+        if low == middle == high:
+            return middle
+        if self.interval is None:
+            return f"{middle} ({len(self.values)} seeds: {low} to {high})"
+        return f"{middle} [{low}, {high}]"
+
+    def _said(self, value: float) -> str:
+        beyond = self.limit is not None and value >= self.limit
+        return f"over {self.limit:,.4g}" if beyond else f"{value:,.4g}"
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        low, high = self.interval or (None, None)
+        return {
+            "what": self.what, "values": list(self.values), "limit": self.limit,
+            "median": self.median, "low": low, "high": high,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -124,7 +200,10 @@ class ChapterPage:
         section: where in Mitchell 1997.
         text: the explanation, one paragraph per entry.
         rows: numbers, printed and computed.
-        drawings: grids and charts.
+        drawings: grids, charts and pictures.
+        source: whose experiment it is, if it is not the book's own.
+        measured: what was measured with several seeds.
+        facts: what it is made of, by name.
     """
 
     page: str
@@ -133,11 +212,24 @@ class ChapterPage:
     text: tuple[str, ...]
     rows: tuple[Row, ...]
     drawings: tuple[Drawing, ...] = ()
+    source: str = ""
+    measured: tuple[Measured, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def reproduced(self) -> bool:
-        """Whether nothing differs from what was printed, known misprints aside."""
-        return all(row.verdict != DIFFERS for row in self.rows)
+        """Whether nothing differs from what was printed or published, known misprints aside."""
+        return all(row.verdict not in (DIFFERS, NOT_REPRODUCED) for row in self.rows)
+
+    @property
+    def wrong(self) -> list[str]:
+        """What differs although it is exact: something is broken, here or in the book."""
+        return [row.what for row in self.rows if row.verdict == DIFFERS]
+
+    @property
+    def where(self) -> str:
+        """The place in the book, and whose experiment it is."""
+        return f"Mitchell 1997, {self.section}" + (f"; {self.source}" if self.source else "")
 
     def plain(self) -> dict[str, Any]:
         """Everything but the drawings, ready for JSON."""
@@ -147,6 +239,7 @@ class ChapterPage:
             "section": self.section,
             "reproduced": self.reproduced,
             "rows": [asdict(row) for row in self.rows],
+            "measured": [one.plain() for one in self.measured],
         }
 
 
@@ -169,6 +262,16 @@ def claim(what: str, book: str, ours: float | str, holds: bool, note: str = "") 
         'agrees'
     """
     return Row(what, book, ours, AGREES if holds else DIFFERS, note)
+
+
+def published(what: str, book: str, ours: float | str, holds: bool, note: str = "") -> Row:
+    """What was published of an experiment, beside what ours gave; where it does not hold, that is a result too.
+
+    Example:
+        >>> published("median failures", "at most 100", 130.0, holds=False).verdict
+        'not reproduced'
+    """
+    return Row(what, book, ours, AGREES if holds else NOT_REPRODUCED, note)
 
 
 def misprint(what: str, book: float | str, right: float, ours: float, note: str, tol: float = 1e-9) -> Row:
