@@ -1,6 +1,6 @@
 """What the lab's verdict on a network is worth: predicted at the start, then trained, on random finite problems.
 
-    python scripts/verdict_study.py                                  # 320 problems, ten minutes of one core
+    python scripts/verdict_study.py                                  # 320 problems, eleven minutes of one core
     python scripts/verdict_study.py --problems 20 --updates 500      # a look
     python scripts/verdict_study.py --json --figure docs/images/network-verdict.svg
 
@@ -23,7 +23,7 @@ Areas under the ROC curve are of "diverges" against "stays", with 95 % intervals
 problem (Obuchowski 1997). Three more stand beside them: α alone; the kernel's numbers shuffled, which must give 0.5;
 and linear features with a fixed policy, whose verdict is exact, which must give 1. It prints, among others:
 
-    linear control                           61         9       250 1.000 (1.00..1.00) ...
+    linear control                          102        18       200 1.000 (1.00..1.00) ...
 """
 
 from __future__ import annotations
@@ -378,7 +378,7 @@ def picture(rows: Sequence[Row], caption: str) -> Drawing:
         points.append(Series(f"{policy} policy", np.arange(1.0, len(low) + 1), middle, "line", colour, low, high))
     curves.append(Series("chance", np.array([0.0, 1]), np.array([0.0, 1]), "dotted", EXACT))
     return Drawing(
-        "network-verdict", "A verdict at fresh weights ranks problems; it does not decide", "ours", caption,
+        "network-verdict", "Fresh networks: a verdict helps with a fixed policy, hardly in control", "ours", caption,
         (
             Panel("Told apart before training", "share of those that stay, named", "share of those that diverge, named",
                   tuple(curves), y_limits=(0, 1.02), legend="lower right"),
