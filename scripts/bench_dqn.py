@@ -1,7 +1,9 @@
 """DQN side by side with Stable-Baselines3 at equal steps: our defaults, our presets, and theirs as tuned by the RL zoo.
 
+"before" is what our defaults were up to 0.3.1, plain DQN, for environments that had no preset then.
+
     pip install "neuralq[bench,box2d]"
-    python scripts/bench_dqn.py [CartPole-v1 ...] [--learners default preset sb3] [--seeds 5] [--out FILE] [--json]
+    python scripts/bench_dqn.py [CartPole-v1 ...] [--learners default preset sb3 before] [--seeds 5] [--out FILE]
 
 Every case trains for the zoo's number of steps on one thread. The final return is the mean of 100 greedy episodes of
 the agent that is there at the end; a row gives the interquartile mean over seeds with its stratified bootstrap
@@ -62,14 +64,28 @@ ZOO: dict[str, tuple[int, dict[str, Any]]] = {
     "Acrobot-v1": (100_000, _ACROBOT),
     "LunarLander-v3": (100_000, _ACROBOT),
 }  # fmt: skip
+OURS: dict[str, tuple[int, dict[str, Any]]] = {
+    # An environment of our own, with its arguments: without a time limit an untrained agent never comes back.
+    "neuralq/WindyGridworld-v0": (20_000, {"max_episode_steps": 200}),
+}
+BEFORE: dict[str, Any] = {
+    "gamma": 0.99, "reward_scale": 1.0, "body": {"class": "MLP", "hidden": [128, 128], "layer_norm": False},
+    "replay": {
+        "target_rule": "q_learning", "num_steps": 1, "num_envs": 1, "capacity": 50_000, "batch_size": 64,
+        "learning_starts": 1_000, "train_period": 1, "updates_per_period": 1, "target_period_updates": 500,
+        "learning_rate": 5e-4, "optimiser": "adam", "loss": "huber", "max_grad_norm": 10.0,
+    },
+}  # fmt: skip
 SCALE = {  # uniformly random actions over 1,000 episodes, and the return at which Gymnasium calls it solved
     "CartPole-v1": (22.0, 475.0),
     "MountainCar-v0": (-200.0, -110.0),
     "Acrobot-v1": (-499.0, -100.0),
     "LunarLander-v3": (-183.0, 200.0),
+    "neuralq/WindyGridworld-v0": (-200.0, -15.0),  # the optimum
 }
 DEFAULT = ("CartPole-v1", "MountainCar-v0", "Acrobot-v1")  # those that need no extra
 LEARNERS = ("default", "preset", "sb3")
+STEPS = {env: steps for env, (steps, _) in (ZOO | OURS).items()}
 
 
 def learn(env: str, learner: str, seed: int, total_steps: int, num_episodes: int) -> dict[str, Any]:
@@ -85,16 +101,19 @@ def learn(env: str, learner: str, seed: int, total_steps: int, num_episodes: int
 def _train_ours(env: str, learner: str, seed: int, total_steps: int, num_episodes: int) -> tuple[float, float]:
     given = {"env": env, "learner": "replay", "seed": seed, "total_steps": total_steps, "resume_probe": False}
     given |= {"evaluate_every": total_steps, "checkpoint_every": 10**9}
+    if env in OURS:
+        given["env_kwargs"] = OURS[env][1]
     with tempfile.TemporaryDirectory() as folder:
         run = neuralq.train(configured(learner, given), folder)
         return evaluate_run(folder, num_episodes).mean, run.cpu_seconds
 
 
 def configured(learner: str, given: dict[str, Any]) -> RunConfig:
-    """With the environment's preset, or what an environment without one gets."""
+    """With the environment's preset, or what an environment without one gets, now or before."""
     if learner == "preset":
         return with_preset(given)
-    return config_from_dict({**cut_to_budget(PRESETS[ANY, "replay"], given)[0], **given})
+    settings = BEFORE if learner == "before" else PRESETS[ANY, "replay"]
+    return config_from_dict({**cut_to_budget(settings, given)[0], **given})
 
 
 def _train_sb3(env: str, learner: str, seed: int, total_steps: int, num_episodes: int) -> tuple[float, float]:
@@ -154,7 +173,7 @@ def average_of(learner: str, results: Sequence[dict[str, Any]]) -> dict[str, Any
 def cases_of(options: argparse.Namespace, known: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Every case's result, from the file where it stands there."""
     for env in options.envs or DEFAULT:
-        total_steps = options.total_steps or ZOO[env][0]
+        total_steps = options.total_steps or STEPS[env]
         for learner in options.learners:
             for seed in range(options.first_seed, options.first_seed + options.seeds):
                 names = {"env": env, "learner": learner, "seed": seed, "env_steps": total_steps}
@@ -168,8 +187,9 @@ def cases_of(options: argparse.Namespace, known: list[dict[str, Any]]) -> Iterat
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("envs", nargs="*", help=f"of {', '.join(ZOO)} (default {' '.join(DEFAULT)})")
-    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=LEARNERS, help="which (default all)")
+    parser.add_argument("envs", nargs="*", help=f"of {', '.join(STEPS)} (default {' '.join(DEFAULT)})")
+    which = (*LEARNERS, "before")
+    parser.add_argument("--learners", nargs="+", choices=which, default=LEARNERS, help="which (default all but before)")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds (default 5)")
     parser.add_argument("--first-seed", type=int, default=2000, help="settings were chosen on seeds below it")
     parser.add_argument("--total-steps", type=int, help="environment steps in place of the zoo's")
@@ -177,7 +197,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="a file of JSON lines that takes every case, and gives those it has")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     options = parser.parse_args()
-    if unknown := [env for env in options.envs if env not in ZOO]:
+    if unknown := [env for env in options.envs if env not in (ZOO if "sb3" in options.learners else STEPS)]:
         parser.error(f"the zoo's settings for {', '.join(unknown)} are not written down; choose from {', '.join(ZOO)}")
     torch.set_num_threads(1)
     has_file = options.out is not None and options.out.exists()

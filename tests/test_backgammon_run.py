@@ -26,6 +26,7 @@ import pytest
 
 import neuralq
 from neuralq.apps.cli import main
+from neuralq.apps.pages import gammon
 from neuralq.apps.pages.gammon import points_against
 from neuralq.runs.folder.run_folder import RunFolderError, read_config, read_metrics, read_summary
 from neuralq.systems.backgammon import BackgammonAgent, SelfPlay, SelfPlaySettings, ValueNetwork
@@ -240,6 +241,8 @@ def test_a_run_has_a_page_with_its_points_and_openings(tmp_path: Path, capsys: p
     assert [curve.tolist() for curve in points_against(rows, "random")][:2] == [
         [3.0, 6.0], [row["ppg_random"] for row in rows]
     ]  # fmt: skip
+    turns = [{"env_steps": 10, "games": 1}, {"env_steps": 30, "games": 3}]
+    assert gammon._games_at(turns, [20.0, 30.0]) == [2.0, 3.0] and gammon._games_at([], [20.0]) == []
     assert f"{run.games} games by TD(λ)" in text and f"{load_agent(run.run_dir).network.flat.size:,} weights" in text
     best = load_agent(run.run_dir).ranked_turns(Position.initial(), (2, 1), 1)[0]
     cells = re.findall(r'<th scope="row">2-1</th><td>([^<]+)</td><td>([^<]+)</td><td>([^<]+)</td>', page)

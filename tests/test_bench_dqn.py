@@ -46,6 +46,9 @@ def test_the_default_knows_nothing_of_the_environment() -> None:
     assert default.reward_scale == 1.0 != preset.reward_scale
     other = configured("default", {**given, "env": "Acrobot-v1"})
     assert dataclasses.replace(default, env="Acrobot-v1") == other
+    before = configured("before", given)
+    assert before.replay.target_period_updates == 500 and before.replay.average_updates is None
+    assert before.epsilon_decay_steps == default.epsilon_decay_steps == 2500 and before.reward_scale == 1.0
 
 
 def test_a_benchmark_that_was_stopped_goes_on(

@@ -138,6 +138,10 @@ def test_the_rule_needs_more_than_the_standard_error() -> None:
 
         return str(play_off(final, best, 2, most_steps, 0)["agent"])
 
+    ups = play_off(
+        lambda n, at: Evaluation((4.0,) * n, (1,) * n, 0), lambda n, at: Evaluation((3.0, 5.0), (1, 1), 0), 2, 1, 0
+    )
+    assert (ups["final_standard_error"], ups["best_standard_error"]) == (0.0, pytest.approx(1.0))
     assert (agent(0.0, 1), agent(0.001, 1), agent(0.0, 5)) == ("final", "best", "best")
 
 

@@ -103,13 +103,23 @@ def test_the_file_gives_the_runs_values(
         assert np.array_equal(np.isfinite(values[0]), np.asarray(mask) != 0)
 
 
+QUANTILES = ["--replay.distribution", "quantile", "--replay.num-atoms", "5", "--dueling", "true"]
+
+
 @pytest.mark.slow
-def test_dueling_streams_of_a_distribution(tmp_path: Path, capsys: Capture) -> None:
-    """They are reshaped twice, and neither may remember the batch that was traced."""
-    words = ["--preset", "false", "--total-steps", "40", "--learner", "replay", "--replay.learning-starts", "20"]
-    words += ["--replay.distribution", "quantile", "--replay.num-atoms", "5", "--dueling", "true", "--hidden", "8"]
-    words += ["--evaluation-episodes", "1", "--run-dir", str(tmp_path / "run")]
-    assert main(["train", "CartPole-v1", *words]) == 0
+@pytest.mark.parametrize(
+    "agent",
+    [
+        ["--preset", "false", "--learner", "replay", *QUANTILES],
+        ["--preset", "false", "--learner", "replay", "--replay.noisy", "true"],
+        ["--preset", "rainbow"],
+    ],
+    ids=["dueling quantiles", "noisy", "rainbow"],
+)
+def test_dueling_streams_of_a_distribution_and_noisy_layers(agent: list[str], tmp_path: Path, capsys: Capture) -> None:
+    """Both parts of the former are reshaped and may not remember a traced batch; the latter play by their means."""
+    words = ["--total-steps", "40", "--replay.learning-starts", "20", "--hidden", "8", "--evaluation-episodes", "1"]
+    assert main(["train", "CartPole-v1", *agent, *words, "--run-dir", str(tmp_path / "run")]) == 0
     capsys.readouterr()
     assert main(["export", str(tmp_path / "run"), "--onnx", str(tmp_path / "policy.onnx"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

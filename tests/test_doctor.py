@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from torch import nn
 
 from neuralq.apps.cli import main
-from neuralq.doctor import CannotLoad, Finding, Report, examine
+from neuralq.doctor import CannotLoad, Finding, Report, examination, examine
 from neuralq.doctor.examination import NUM_PARTS
 from neuralq.doctor.findings import CAUSES
 
@@ -31,6 +32,22 @@ def best_values() -> Any:
 class Raising(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         raise RuntimeError("the simulator crashed")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_episodes() -> Iterator[None]:
+    """What is asked here does not depend on how many are played."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, number in (("NUM_GREEDY", 12), ("NUM_EXPLORED", 8), ("NUM_OTHER", 8)):
+            patch.setattr(f"neuralq.doctor.exam.case.{name}", number)
+        yield
+
+
+@pytest.fixture
+def without_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the measurements that train networks, which take more time than all others."""
+    for name in ("R5", "R7"):
+        monkeypatch.delitem(examination._MEASUREMENTS, name)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +105,9 @@ def test_exact_values_of_a_model_are_healthy() -> None:
 
 
 def test_the_caller_has_the_last_word_on_the_discount() -> None:
-    first, second = (examine(lambda s: np.zeros((len(s), 2)), "CartPole-v1", gamma=g, budget_s=2) for g in (None, 0.5))
+    first, second = (
+        examine(lambda s: np.zeros((len(s), 2)), "CartPole-v1", gamma=g, budget_s=0.2) for g in (None, 0.5)
+    )
     assert (first.gamma, second.gamma) == (0.99, 0.5)
 
 
@@ -139,17 +158,19 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("without_training")
 def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "report.html"
-    command = ["doctor", str(weights), "--env", "CartPole-v1", "--budget", "9s", "--set", "lr=1e-3", "--json"]
+    command = ["doctor", str(weights), "--env", "CartPole-v1", "--set", "lr=1e-3", "--json"]
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["healthy"] is False and said["report"] == str(page) and page.is_file()
     assert {"R1", "R2", "R6a"} <= {one["id"] for one in said["measured"]}
 
 
+@pytest.mark.usefixtures("without_training")
 def test_the_command_exits_with_2_where_nothing_can_be_loaded(
     weights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -161,6 +182,7 @@ def test_the_command_exits_with_2_where_nothing_can_be_loaded(
     assert "Traceback" not in error
 
 
+@pytest.mark.usefixtures("without_training")
 def test_the_command_exits_with_0_where_all_is_well(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -191,6 +213,7 @@ def test_the_command_exits_with_0_where_all_is_well(
     assert status == 0 and "Healthy" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("without_training")
 def test_a_run_that_misses_its_target_ends_with_three_findings_and_one_that_asks_with_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

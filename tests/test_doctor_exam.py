@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch import nn
 
-from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
@@ -25,6 +25,16 @@ from neuralq.doctor.worlds import open_world
 from neuralq.exact import solve
 from neuralq.mdp import FiniteMDP
 from neuralq.types import Array
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_episodes() -> Iterator[None]:
+    """What is measured here is known exactly or nearly; a third of the episodes say it as well."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, number in (("NUM_GREEDY", 30), ("NUM_EXPLORED", 12), ("NUM_OTHER", 12)):
+            patch.setattr(f"neuralq.doctor.exam.case.{name}", number)
+        yield
+
 
 GAMMA = 0.9
 ENDS = 30  # steps after which the world ends
@@ -350,7 +360,8 @@ def test_churn_grows_with_the_step_and_leaves_the_subject_alone() -> None:
     with torch.no_grad():
         net.weight[:], net.bias[:] = torch.tensor([[0.01, 0.0], [-0.01, 0.0]]), 0.0
     before = [p.clone() for p in net.parameters()]
-    tiny, huge = (case_of(noisy, net, settings=Settings(learning_rate=rate)) for rate in (1e-9, 1.0))
+    pays = lambda: Counting(pays=lambda t, a: 1.0 - 2.0 * a, shows=lambda t, rng: [rng.normal(), rng.normal()])  # noqa: E731
+    tiny, huge = (case_of(pays, net, settings=Settings(learning_rate=rate)) for rate in (1e-9, 1.0))
     assert network.churn(tiny).value == 0 and not network.churn(tiny).flagged
     assert network.churn(huge).value > 0.1 and network.churn(huge).flagged
     assert all(torch.equal(a, b) for a, b in zip(before, net.parameters(), strict=True))
@@ -379,6 +390,18 @@ def test_plasticity_of_a_fresh_network_is_that_of_a_fresh_network() -> None:
         net[0].weight[:] = 0.0  # type: ignore[index]
         net[0].bias[:] = -1.0  # type: ignore[index]
     assert network.plasticity(case_of(noisy, net)).flagged  # no unit of it can move any more
+
+
+def test_a_network_that_is_too_small_is_told_from_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Returns rise, fall and rise again along an episode, and one unit bends a line once."""
+    monkeypatch.setattr(capacity, "_NUM_STEPS", 100)
+
+    def waving() -> gym.Env[Any, Any]:
+        return Counting(pays=lambda t, a: 3 * math.cos(t / 3), shows=lambda t, rng: [t / 15 - 1, 0.0])
+
+    narrow, wide = (capacity.capacity(case_of(waving, two_layers(units))) for units in (1, 64))
+    assert narrow.flagged and narrow.cause == "representation" and narrow.grade == "B"
+    assert not wide.flagged and wide.value < 0.1
 
 
 # D1–D5: stored experience.
@@ -477,6 +500,8 @@ def test_the_first_cause_comes_first() -> None:
     assert first(wrong, flagged("V5", "algorithm"), flagged("E6", "environment")) == "E6"
     assert first(wrong, flagged("V3", "algorithm"), flagged("V5", "algorithm")) == "V5"
     assert first(wrong, flagged("D3", "data"), flagged("R1", "algorithm")) == "D3"
+    assert first(wrong, flagged("R7", "representation"), flagged("V6a", "algorithm")) == "R7"
+    assert first(flagged("V4", "algorithm", value=5.0), flagged("R7", "representation"), calm("R1")) == "R7"
     assert first(flagged("E4", "representation", "C", 1e4), wrong) == "E4"
     assert first(flagged("E4", "representation", "C", 50.0), wrong) == "V2"  # beyond the threshold, not far beyond
     assert first(flagged("X3", "algorithm", "A"), flagged("E6", "environment")) == "X3"
@@ -487,6 +512,9 @@ def test_a_policy_that_has_learned_right_values_is_healthy_whatever_its_vital_si
         [calm("V1"), calm("V2"), calm("V4"), flagged("R1", "algorithm"), flagged("V5", "algorithm")]
     )
     assert {one.grade for one in found} == {"C"} and headline.startswith("Healthy")
+    for name, value, grade in (("V4", 1.2, "C"), ("V4", 1.5, "B"), ("V4", math.nan, "B"), ("V6a", 0.7, "C")):
+        found, _ = decide([calm("V1"), calm("V2"), flagged(name, "algorithm", value=value)])
+        assert [one.grade for one in found] == [grade]
     found, headline = decide([calm("V1"), calm("V2"), flagged("D1", "data")])
     assert found[0].grade == "B" and headline.startswith("Data")
 

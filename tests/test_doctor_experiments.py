@@ -13,9 +13,10 @@ from gymnasium import spaces
 from torch import nn
 
 from neuralq.doctor import Settings, examine
+from neuralq.doctor.exam.capacity import t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.exam.network import fresh
-from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, _t_interval, fit
+from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, fit
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.play import Clock
 from neuralq.doctor.subject import of_network
@@ -62,7 +63,7 @@ def test_intervals_are_students_and_those_of_every_resample() -> None:
     from scipy.stats import ttest_1samp
 
     a, b = [1.0, 2.0, 4.0], [0.0, 0.5, 0.2]
-    assert _t_interval(a) == pytest.approx(tuple(ttest_1samp(a, 0).confidence_interval()))
+    assert t_interval(a) == pytest.approx(tuple(ttest_1samp(a, 0).confidence_interval()))
     means = [np.array([np.mean(one) for one in product(v, repeat=3)]) for v in (a, b)]  # 27 each; of 3 none is cut off
     every = np.subtract.outer(*means)
     assert _difference(a, b) == pytest.approx(np.percentile(every, [2.5, 97.5]), abs=0.1)

@@ -238,3 +238,17 @@ def test_labelled_trials_are_counted() -> None:
     assert answer.v.tolist() == [-3.0, -2.0, -1.0] and answer.converged
     stopped = solve(corridor(), 1.0, "labelled-rtdp", max_iterations=1)
     assert (stopped.iterations, stopped.backups, stopped.converged) == (1, 4 + 1 + 2 + 2 + 4, False)
+
+
+@pytest.mark.parametrize(("residual", "iterations"), [(3.9, 64 + 21 * 33), (4.2, 1500)])
+def test_trials_stop_where_rounding_keeps_the_residual_from_falling(residual: float, iterations: int) -> None:
+    """Two loops with γ = 1 − 1e-7, one of which earns a little less than the upper bound of both says.
+
+    Its residual, some roundings of one backup, is a whole number of units in the last place of values of 1e7, and
+    loses one of them in 4e5 backups. A round of trials makes 33 · 120 of them: after the first check 21 find no lower
+    one. Above four roundings nothing stops them.
+    """
+    mdp, gamma = FiniteMDP.from_arrays([[[1.0, 0.0], [0.0, 1.0]]], [[1.0], [1.0]]), 1 - 1e-7
+    rounding = prepare(mdp, gamma).rounding(np.full(1, 1e7))
+    less = dataclasses.replace(mdp, reward=np.array([1.0 - residual * rounding, 1.0]))
+    assert solve(less, gamma, "rtdp", max_iterations=1500).iterations == iterations

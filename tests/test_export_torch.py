@@ -24,6 +24,7 @@ from safetensors.torch import load_file
 
 import neuralq
 from neuralq.apps.cli import main
+from neuralq.learners import ReplaySettings
 from neuralq.q import MLP, Conv
 from neuralq.q.custom import Custom
 from neuralq.runs import RunConfig
@@ -55,6 +56,7 @@ def odd(which: str, masked: bool = False) -> GivenSpace:
 
 gym.register("test/Odd-v0", odd)
 NORMED = {"body": MLP((7, 5), layer_norm=True, activation="tanh")}
+NOISY = {"learner": "replay", "replay": ReplaySettings(noisy=True), **NORMED}
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "plain": ("vector", {"body": MLP((8, 8))}),
     "normalised layers": ("vector", NORMED),
@@ -70,6 +72,8 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "stacked frames": ("stack", {"body": Conv((3,), (3,), (1,), (5,), layer_norm=False)}),
     "flags": ("flags", {"body": Conv((3,), (3,), (1,), (5,))}),
     "composed": ("dict", NORMED),
+    "noisy": ("vector", NOISY),
+    "noisy and separate": ("start", {"layout": "separate", **NOISY}),
 }
 
 

@@ -6,6 +6,7 @@ it; a margin that counts directions which nothing moves; a parameter handed to a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,16 @@ import pytest
 
 from neuralq.lab.methods import method
 from neuralq.lab.trial import run
-from neuralq.lab.verdicts.critical import CRITICAL_PARAMETERS, NoBoundary, critical, scan, stability_margin
+from neuralq.lab.verdicts.critical import (
+    CRITICAL_PARAMETERS,
+    NoBoundary,
+    StabilityScan,
+    _crossings,
+    _values_of,
+    critical,
+    scan,
+    stability_margin,
+)
 from neuralq.mdp import FiniteMDP
 from neuralq_envs.counterexamples import Problem, star
 
@@ -50,8 +60,6 @@ def test_two_boundaries_are_both_found() -> None:
 
 
 def test_a_narrow_window_between_two_points_is_found() -> None:
-    from neuralq.lab.verdicts.critical import _crossings
-
     values = np.linspace(0, 1, 11)
 
     def margin(x: float) -> float:
@@ -105,3 +113,99 @@ def test_mistakes_are_named() -> None:
         critical(star(), "gamma", step_size=-1.0)
     with pytest.raises(ValueError, match="changes with the weights"):
         stability_margin(star(), method("residual-adaptive"))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "first", "second", "last", "count"),
+    [
+        ("gamma", 0.0, 1 / 240, 1 - 1e-9, 241),
+        ("lambda_", 0.0, 1 / 240, 1 - 1e-9, 241),
+        ("eta", 1e-6, 1e-6 * 10 ** (9 / 240), 1e3, 241),
+        ("phi", 0.0, 1 / 240, 1 - 1e-9, 241),
+        ("period", 1.0, 2.0, 1024.0, 1024),
+        ("tau", 1e-6, 1e-6 * 10 ** (6 / 240), 1.0, 241),
+        ("beta", 0.0, 1 / 240, 1 - 1e-9, 241),
+        ("beta_over_alpha", 1e-4, 1e-4 * 10 ** (8 / 240), 1e4, 241),
+        ("num_steps", 1.0, 2.0, 256.0, 256),
+    ],
+)
+def test_where_each_parameter_is_looked_at(
+    parameter: str, first: float, second: float, last: float, count: int
+) -> None:
+    values = _values_of(parameter, CRITICAL_PARAMETERS[parameter], None)
+    assert len(values) == count and (values[0], values[-1]) == pytest.approx((first, last), rel=1e-13)
+    assert values[1] == pytest.approx(second, rel=2e-9)
+
+
+def test_bounds_replace_the_range() -> None:
+    for parameter, bounds, ends in (
+        ("gamma", (-0.5, 2.0), (-0.5, 2.0)),
+        ("gamma", (0.25, 1.0), (0.25, 1 - 1e-9)),  # at γ = 1 there are no values
+        ("eta", (0.5, 1.0), (0.5, 1.0)),
+        ("period", (3.0, 5.0), (3.0, 5.0)),
+    ):
+        values = _values_of(parameter, CRITICAL_PARAMETERS[parameter], bounds)
+        assert (values[0], values[-1]) == pytest.approx(ends, rel=1e-13)
+        assert len(values) == (3 if parameter == "period" else 241)
+    for parameter, bounds in (
+        ("gamma", (0.5, 0.5)),
+        ("gamma", (0.6, 0.5)),
+        ("gamma", (-np.inf, 0.5)),
+        ("gamma", (0.5, np.nan)),
+        ("eta", (0.0, 1.0)),
+        ("period", (0.0, 5.0)),
+        ("period", (-1.0, 5.0)),
+    ):
+        with pytest.raises(ValueError, match="must be finite numbers"):
+            scan(star(), parameter, bounds=bounds)
+
+
+def crossings(margin: Callable[[float], float], values: np.ndarray) -> tuple[float, ...]:
+    return _crossings(margin, values, np.array([margin(x) for x in values]))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("middle", [0.1, 0.55, 0.9])
+def test_a_dip_between_two_points_is_found_from_both_sides_and_at_both_ends(sign: float, middle: float) -> None:
+    found = crossings(lambda x: sign * ((x - middle - 0.003) ** 2 - 1e-6), np.linspace(0, 1, 11))
+    assert found == pytest.approx((middle + 0.002, middle + 0.004), abs=1e-9)
+
+
+def test_dips_that_are_alike_at_all_points_are_looked_into_and_what_only_touches_zero_is_no_crossing() -> None:
+    # -.1 half-way between neighbours, 1.9 at every point
+    found = crossings(lambda x: 0.9 + float(np.cos(2 * np.pi * x)), np.arange(4.0))
+    assert len(found) >= 2 and np.cos(2 * np.pi * np.array(found)) == pytest.approx(-0.9)
+    assert crossings(lambda x: max(abs(x - 0.45) - 0.01, 0.0), np.linspace(0, 1, 6)) == ()
+    # ends of the range are no dips, and the margin of one that falls to its end is not looked at beyond it
+    assert crossings(lambda x: 1.01 - x, np.linspace(0, 1, 11)) == ()
+    assert crossings(lambda x: x - 0.5, np.array([0.0, 1.0])) == pytest.approx((0.5,))
+
+
+def by_hand(margins: list[float], boundaries: tuple[float, ...]) -> StabilityScan:
+    return StabilityScan("toy", "td", "eta", None, np.arange(1.0, len(margins) + 1), np.array(margins), boundaries)
+
+
+def test_intervals_begin_as_the_first_margin_says_and_change_at_every_boundary() -> None:
+    assert by_hand([0.5, -1.0, 1.0, 1.0], (1.5, 2.5)).intervals == ((1, 1.5, True), (1.5, 2.5, False), (2.5, 4, True))
+    edge = by_hand([0.0, 1.0, -1.0], (1.5, 2.5))  # at 0 it is not stable yet
+    assert edge.intervals == ((1, 1.5, False), (1.5, 2.5, True), (2.5, 3, False)) and edge.stable == ((1.5, 2.5),)
+    assert edge.first() == 1.5 and edge.plain()["critical"] == 1.5 and edge.plain()["range"] == [1.0, 3.0]
+    still = by_hand([1.0, 2.0], ())
+    assert still.stable == ((1.0, 2.0),) and still.plain()["critical"] is None
+    with pytest.raises(NoBoundary, match="is unstable for every eta from 1 to 2"):
+        by_hand([0.0, 0.0], ()).first()
+
+
+def test_margins_with_a_step_size_are_what_is_left_to_one() -> None:
+    problem = replace(two_states((1, 2)), step_size=0.5)  # A = −.2
+    assert stability_margin(problem, method("td")) == pytest.approx(-0.2)
+    assert stability_margin(problem, method("td"), 0.25) == pytest.approx(1 - 1.05)
+    nothing = replace(problem, features=np.zeros((2, 1)))
+    assert stability_margin(nothing, method("td")) > 1e300 and stability_margin(nothing, method("td"), 0.5) == 1.0
+    # a target that is copied every time is TD with the problem's own step size, though it is no flow
+    assert stability_margin(problem, method("hard-target"), period=1) == pytest.approx(1 - 1.1)
+    # A method without an expected update, and a scan in which no value has one.
+    with pytest.raises(ValueError, match="no expected update"):
+        stability_margin(problem, replace(method("td"), expected=None))
+    with pytest.raises(ValueError, match="changes with the weights"):
+        scan(problem, "gamma", "residual-adaptive")

@@ -24,6 +24,7 @@ from neuralq.lab.watch.advice import RunTraits, advise
 from neuralq.lab.watch.growth import fit_growth
 from neuralq.lab.watch.monitor import DivergenceMonitor, DivergenceWarning
 from neuralq.learners import OnlineSettings, ReplaySettings, RolloutSettings
+from neuralq.learners.learner import Update
 from neuralq.q import MLP, ActionOutputQ, LinearQ, TableQ
 from neuralq.runs import RunConfig, train
 from neuralq.runs import loop as training
@@ -201,6 +202,12 @@ def test_what_it_says_of_values_repeats_and_is_of_the_values(scaled: dict[str, A
     assert one["bound"] == two["bound"] == pytest.approx(10, rel=1e-3)
     rows = [row for row in read_metrics(tmp_path / "one") if row["kind"] == "train"]
     assert one["largest_value"] == two["largest_value"] == max(row.get("max_abs_q", 0.0) for row in rows) > 0
+
+
+def test_the_largest_value_of_an_update_is_that_of_its_pairs() -> None:
+    """Q = target − δ: 2 − 1 and −4 + 2.5."""
+    seen = Update(torch.tensor([1.0, -2.5]), torch.tensor([2.0, -4.0])).metrics()
+    assert (seen["max_abs_q"], seen["max_q"]) == (1.5, 2.0)
 
 
 def test_growth_is_said_once_for_each_measure_and_not_below_the_bound() -> None:

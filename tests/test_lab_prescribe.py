@@ -8,13 +8,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from neuralq.lab.problems import problem
 from neuralq.lab.trial import run
-from neuralq.lab.verdicts.remedies import Remedy, _rank, prescribe
+from neuralq.lab.verdicts.diagnosis import diagnose
+from neuralq.lab.verdicts.remedies import (
+    Remedy,
+    _on_policy,
+    _rank,
+    _round,
+    _smaller_steps,
+    _some_way_on,
+    prescribe,
+    usual_method,
+)
+from neuralq.mdp import FiniteMDP
+from neuralq_envs.counterexamples import Problem
 
 
 @pytest.fixture(scope="module", params=["baird", "emphatic"])
@@ -111,3 +124,95 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ValueError, match="not linear in its weights"):
         prescribe(problem("spiral"))
     assert np.isfinite([len(one.explain()) for one in prescribe(problem("chattering"))]).all()
+
+
+def by_hand(**changes: Any) -> Remedy:
+    """A remedy whose mean error shrinks by .5 in every update."""
+    found = diagnose(problem("baird-tabular"))
+    names = ("spectral_radius", "updates", "fixed_point_error", "best_error", "scale")
+    told = {name: changes.pop(name) for name in names if name in changes}
+    found = dataclasses.replace(found, **{"spectral_radius": 0.5, "fixed_point_error": None, **told})
+    given = Remedy("phi", "do so", None, problem("baird"), "td", {}, 0.1, None, found, None)
+    return dataclasses.replace(given, **changes)
+
+
+def test_what_a_remedy_costs_in_words() -> None:
+    assert by_hand().explain() == "Do so. The slowest error shrinks to a tenth in 3 updates."
+    assert by_hand(updates=100, margin="from 1 on").explain() == (
+        "Do so (it converges from 1 on). The slowest error shrinks to a tenth in 332 updates."
+    )
+    assert by_hand(spectral_radius=0.0).explain() == "Do so. The mean is right after one application."
+    assert by_hand(spectral_radius=1.0).explain() == "Do so."
+    assert by_hand(fixed_point_error=0.5, best_error=None).explain().endswith("updates.")
+    assert (
+        by_hand(fixed_point_error=0.5, best_error=1e-12)
+        .explain()
+        .endswith(" It ends 0.5 (RMS) from the true values; the best weights are 0 from them.")
+    )
+    for radius, scatters in ((None, False), (0.999, False), (1.0, True), (1.5, True)):
+        one = by_hand(second_moment_radius=radius)
+        assert one.scatters == scatters == one.plain()["scatters"]
+        assert one.explain().endswith("only the average converges.") == scatters
+
+
+def test_updates_to_a_tenth() -> None:
+    for radius, updates, expected in (
+        (0.1, 1, 1.0),
+        (0.01, 6, 3.0),
+        (0.0, 6, 6.0),
+        (1.0, 1, math.inf),
+        (2.0, 1, math.inf),
+    ):
+        one = by_hand(spectral_radius=radius, updates=updates)
+        assert one.updates_to_tenth == pytest.approx(expected)
+    assert by_hand(spectral_radius=1.0).plain()["updates_to_tenth"] is None
+    assert [_round(updates) for updates in (2.4, 999_999.0, 1e6, 1.26e7)] == ["2", "999,999", "1e+06", "1.3e+07"]
+
+
+def test_the_rank_of_a_fixed_point_leaves_rounding_and_puts_the_unknown_last() -> None:
+    def grade(**changes: Any) -> int:
+        return _rank(by_hand(**changes))[1]
+
+    assert [grade(), grade(fixed_point_error=0.0, best_error=None)] == [2, 2]
+    for scale, unit in ((4.0, 4.0), (None, 1.0)):
+        errors = ((0.9e-6, 0), (1.1e-6, 2))  # beside a best error of 0, with a millionth of the size of values
+        for error, expected in errors:
+            assert grade(fixed_point_error=error * unit, best_error=0.0, scale=scale) == expected
+    assert grade(fixed_point_error=1.5, best_error=1.0, scale=1e-9) == 0
+    assert _rank(by_hand(second_moment_radius=1.0))[::2] == (True, pytest.approx(math.log(10) / math.log(2)))
+
+
+@pytest.mark.parametrize(
+    ("spacing", "edge", "far", "value"),
+    [
+        ("linear", 0.5, 1.0, 0.55),
+        ("linear", 0.5, 0.0, 0.45),
+        ("log", 1e-2, 1.0, 1e-2 * 100**0.1),
+        ("log", 1.0, 1e-2, 100**-0.1),
+        ("whole", 77.0, 1024.0, 85.0),  # 7.7 more, rounded up
+        ("whole", 5.0, 1024.0, 6.0),
+        ("whole", 77.0, 80.0, 80.0),
+    ],
+)
+def test_a_tenth_of_the_way_on(spacing: str, edge: float, far: float, value: float) -> None:
+    assert _some_way_on(spacing, edge, far) == pytest.approx(value, rel=1e-12)
+
+
+def test_shorter_steps_are_prescribed_up_to_the_bound() -> None:
+    table = problem("baird-tabular")
+    trouble = diagnose(table, step_size=20.0)
+    for bound, given in ((14.0, 7.0), (20.0, 10.0), (20.1, None), (0.0, None), (None, None)):
+        found = list(_smaller_steps(table, "td", dataclasses.replace(trouble, step_size_bound=bound)))
+        assert [one.step_size for one in found if one is not None] == ([] if given is None else [given])
+
+
+def test_the_usual_method_and_whether_the_target_has_a_distribution() -> None:
+    assert [usual_method(problem(name)) for name in ("baird", "baird-control", "chattering")] == [
+        "td", "q-learning", "sarsa",
+    ]  # fmt: skip
+    two = FiniteMDP.from_arrays([[[1.0, 0.0], [0.0, 1.0]]], np.zeros((2, 1)))  # two classes: which, is not determined
+    apart = Problem.from_mdp(two, np.eye(2), gamma=0.5, state_distribution=[0.5, 0.5])
+    assert list(_on_policy(apart, 0.1)) == []
+    (one,) = _on_policy(problem("baird"), 0.1)
+    assert one is not None and one.problem.behaviour_policy is not problem("baird").behaviour_policy
+    assert one.problem.state_distribution == pytest.approx(np.array([0.0] * 6 + [1.0]))

@@ -136,9 +136,7 @@ def stop(row: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "given",
-    [pytest.param({"noisy": True, "target_rate": 0.01, "average_updates": 20.0}, marks=pytest.mark.slow), RAINBOW],
-    ids=["noisy", "all six"],
+    "given", [{"noisy": True, "target_rate": 0.01, "average_updates": 20.0}, RAINBOW], ids=["noisy", "all six"]
 )
 def test_a_run_by_noise_stopped_on_the_way_ends_with_the_same_bits(given: dict[str, Any], tmp_path: Path) -> None:
     learner = {"learning_starts": 40, "batch_size": 8, "capacity": 200, "train_period": 2, **given}

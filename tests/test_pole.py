@@ -81,7 +81,7 @@ def test_the_environment_keeps_its_word_for_many_random_steps(num_steps: int) ->
     env = PoleBoxesEnv(start_spread=0.05)
     rng = np.random.default_rng(0)
     box, extra = env.reset(seed=0)
-    falls = 0
+    falls, starts = 0, [extra["state"]]
     for action in rng.integers(2, size=num_steps).tolist():
         state = extra["state"]
         assert abs(state[0]) <= 2.4 and abs(state[2]) <= 0.2094396 and box == box_of(*state)
@@ -90,7 +90,9 @@ def test_the_environment_keeps_its_word_for_many_random_steps(num_steps: int) ->
         if fallen:
             falls += 1
             box, extra = env.reset()
-            assert (np.abs(extra["state"]) <= 0.05).all()
+            starts.append(extra["state"])
+    spread = np.array(starts)
+    assert (np.abs(spread) <= 0.05).all() and (spread.min(axis=0) < -0.04).all() and (spread.max(axis=0) > 0.04).all()
     assert 20 < num_steps / falls < 25  # a pole pushed at random stands for 22 steps
 
 

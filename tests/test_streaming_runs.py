@@ -66,7 +66,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-QUICK = ("obgd", "intentional", "table")
+QUICK = ("obgd", "intentional", "table", "vectorised twin")
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,18 @@ from neuralq_envs.pole_kernels import box_of
 Capture = pytest.CaptureFixture[str]
 
 DICE = """
+import time
 import numpy as np
 from neuralq.runs.report.claims import ChapterPage, Measured, Picture, number, own, published
 from neuralq.systems import System
 
 
+rolled = []
+
+
 def roll(seed, full):
+    rolled.append(seed)
+    time.sleep(0.2 * (len(rolled) == 1))  # the first one ends after others that began later
     return float(np.random.default_rng(seed).integers(100) + 100 * full)
 
 

@@ -8,6 +8,7 @@ a return that loses what was earned in an earlier call · anything of a loop tha
 from __future__ import annotations
 
 import dataclasses
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,8 +22,9 @@ import torch
 from gymnasium import spaces
 
 import neuralq
-from neuralq import RunConfig
-from neuralq.learners import OnlineSettings, RolloutSettings, TabularSettings
+from neuralq import RunConfig, with_preset
+from neuralq.learners import RolloutSettings, TabularSettings, learner_kinds
+from neuralq.learners.averaging import evaluation_parameters
 from neuralq.learners.tabular.settings import ALGORITHMS
 from neuralq.mdp import FiniteMDP
 from neuralq.runs.control import evaluate_run
@@ -254,6 +256,19 @@ def test_a_table_is_what_the_tabular_learner_learns() -> None:
     assert not build_session(config("neuralq/BlockingMaze-v0")).stream.simulated  # type: ignore[union-attr]
 
 
+def test_where_no_table_is_over_the_observations_every_way_out_is_one(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"needs a finite observation space, got a Box.*, or discretise") as said:
+        build_session(config("CartPole-v1"))
+    others = re.search(r"choose another learner \((.*?)\)", str(said.value))
+    assert others is not None and others[1].split(", ") == [name for name in learner_kinds() if name != "tabular"]
+    for learner in others[1].split(", "):
+        session = build_session(RunConfig(env="CartPole-v1", learner=learner, resume_probe=False))
+        assert walked(session, 64).env_steps >= 64 and session.stream.spec.num_categories is None
+    halves = gym.wrappers.TransformObservation(gym.make("CartPole-v1"), lambda x: int(x[2] > 0), spaces.Discrete(2))
+    run = neuralq.train(halves, tmp_path / "run", learner="tabular", total_steps=100, evaluation_episodes=1)
+    assert neuralq.load(run.run_dir, env=halves).values(1).shape == (2,)
+
+
 def test_a_run_of_a_table_trains_resumes_and_answers(tmp_path: Path) -> None:
     parts, whole = (config(total_steps=n, log_every=100) for n in (200, 400))
     run = neuralq.train(parts, tmp_path / "parts")
@@ -324,7 +339,7 @@ def played(config_: RunConfig, limit: int, gamma: float = 1.0) -> float:
     legal = mdp.legal
     if callable(mask := getattr(gym.make(config_.env).unwrapped, "action_mask", None)):
         legal = np.array([mask(s) != 0 for s in range(mdp.num_states)])
-    entries = session.learner.engine.flat.values.numpy().reshape(legal.shape)
+    entries = evaluation_parameters(session.learner).numpy().reshape(legal.shape)
     rows = mdp.row_index[np.arange(mdp.num_states), np.where(legal, entries, -np.inf).argmax(1)]
     v = np.zeros(mdp.num_states)
     for _ in range(limit):
@@ -373,24 +388,58 @@ def test_the_arithmetic_of_blackjack_is_that_of_the_game() -> None:
 
 def test_over_a_table_learners_have_step_sizes_of_their_own_unless_one_is_named() -> None:
     ice = {"env": "FrozenLake-v1", "layout": "table"}
-    assert neuralq.with_preset({**ice, "learner": "online"}).online.step_size == 0.05  # type: ignore[union-attr]
-    named = neuralq.with_preset({**ice, "learner": "online", "online": {"step_size": 0.5}})
-    assert named == RunConfig(**ice, learner="online", online=OnlineSettings(step_size=0.5))
-    assert RunConfig(**ice).rollout.optimiser == "sgd" and RunConfig(env="FrozenLake-v1").rollout == RolloutSettings()
-    few = neuralq.with_preset({**ice, "rollout": {"num_envs": 2, "num_steps": 4}}).rollout
-    assert few is not None and (few.num_minibatches, few.learning_rate) == (1, 0.8)
-    many = neuralq.with_preset({**ice, "rollout": {"num_envs": 64, "num_minibatches": 1}}).rollout
-    assert many is not None and many.learning_rate == 1.0  # all samples may be of one entry
-    grid = neuralq.with_preset({"env": "neuralq/MitchellGrid-v0", "layout": "table"}).rollout
-    assert grid == neuralq.with_preset({"env": "neuralq/MitchellGrid-v0"}).rollout  # its preset names one
+    own = {name: with_preset({**ice, "learner": name}).settings for name in learner_kinds() if name != "tabular"}
+    steps = {name: (getattr(one, "step_size", None), getattr(one, "anneal", None)) for name, one in own.items()}
+    by_steps = {"online", "streaming", "gradient"}
+    assert {name for name, found in steps.items() if found == (0.1, True)} == by_steps
+    assert own["gradient"].step_size_h == 0.01  # a tenth, as with networks
+    for name in own:
+        assert own[name] != RunConfig(env="FrozenLake-v1", learner=name).settings
+        size = "step_size" if name in by_steps else "learning_rate"
+        named = with_preset({**ice, "learner": name, name: {size: 0.5}})
+        assert named == RunConfig(**ice, learner=name, **{name: learner_kinds()[name].settings(**{size: 0.5})})
+    assert own["rollout"].optimiser == "sgd" and RunConfig(env="FrozenLake-v1").rollout == RolloutSettings()
+    few = with_preset({**ice, "rollout": {"num_envs": 2, "num_steps": 4}}).settings
+    assert (few.num_minibatches, few.learning_rate) == (1, pytest.approx(8 * 0.03))
+    many = with_preset({**ice, "rollout": {"num_envs": 64, "num_minibatches": 1}}).settings
+    assert many.learning_rate == 1.0  # all samples may be of one entry
+    grid = with_preset({"env": "neuralq/MitchellGrid-v0", "layout": "table"}).rollout
+    assert grid == with_preset({"env": "neuralq/MitchellGrid-v0"}).rollout  # its preset names one
+
+
+@pytest.mark.parametrize(
+    ("learner", "given", "expected"),
+    [
+        ("replay", {}, {"learning_rate": 1.6, "target_rate": 1.0, "loss": "squared", "batch_size": 32}),
+        ("replay", {"batch_size": 8}, {"learning_rate": 0.4}),
+        ("replay", {"batch_size": 256}, {"learning_rate": 1.6}),  # all samples may be of one entry
+        ("replay", {"target_period_updates": 50}, {"target_rate": None, "target_period_updates": 50}),
+        ("replay", {"target_rule": "retrace", "block_length": 40}, {"batch_size": 40, "learning_rate": 1.6}),
+        ("replay", {"target_rule": "dqrc"}, {"optimiser": "adam", "learning_rate": 5e-4, "average_updates": None}),
+        ("replay", {"distribution": "quantile"}, {"optimiser": "adam", "learning_rate": 5e-4}),
+        ("replay", {"optimiser": "adam"}, {"learning_rate": 5e-4, "batch_size": 64}),
+        ("rollout", {"optimiser": "adam"}, {"learning_rate": 1e-3, "returns": "peng"}),
+        ("gradient", {"method": "gq"}, {"lambda_": 0.0, "step_size": 0.1, "anneal": True}),
+        ("online", {"trace": "dutch"}, {"step_size": 0.1, "anneal": False}),
+    ],
+)
+def test_step_sizes_over_a_table_go_with_what_is_given(
+    learner: str, given: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    found = with_preset({"env": "FrozenLake-v1", "layout": "table", "learner": learner, learner: given}).settings
+    assert {name: getattr(found, name) for name in expected} == expected
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("learner", "env"), [
-    ("rollout", "FrozenLake-v1"), ("rollout", "CliffWalking-v1"), ("rollout", "Taxi-v4"), ("online", "CliffWalking-v1"),
-])  # fmt: skip
+@pytest.mark.parametrize("env", ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"])
+@pytest.mark.parametrize("learner", ["rollout", "replay", "online", "streaming", "gradient"])
 def test_other_learners_learn_a_table_by_default(learner: str, env: str) -> None:
+    """Rollouts, five seeds, steps of 0.1: 0.7402 each, −13 each, 7.34 to 7.80; with the finer ones of today no worse.
+
+    Half a CPU-minute to four minutes for each learner and environment.
+    """
     limit, least = {"FrozenLake-v1": (100, 0.7202), "CliffWalking-v1": (1000, -13.0), "Taxi-v4": (200, 7.0)}[env]
-    for seed in range(100, 102):
-        plain = {"env": env, "learner": learner, "layout": "table", "seed": seed, "exact": False, "resume_probe": False}
-        assert played(neuralq.with_preset(plain), limit) >= least
+    plain = {"env": env, "learner": learner, "layout": "table", "seed": 200, "exact": False, "resume_probe": False}
+    found = played(with_preset(plain), limit)
+    print(f"{learner} on {env}: {found:.4f}")
+    assert found >= least

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
-from neuralq.doctor.exam import aliasing, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
 from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
@@ -61,6 +61,7 @@ _MEASUREMENTS: dict[str, Measurement] = {
     "V6": values.rank,
     "V8": values.generalisation,
     "V6a": values.better_actions,
+    "R7": capacity.capacity,
     "R5": network.plasticity,
 }
 NUM_PARTS = len(_MEASUREMENTS) + 2

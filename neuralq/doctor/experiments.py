@@ -28,17 +28,17 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.wrappers import TransformObservation, TransformReward
-from torch import Tensor, nn
+from torch import nn
 
+from neuralq.doctor.exam.capacity import labelled, regressed, t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.exam.network import fresh
 from neuralq.doctor.exam.retraining import further_reach, in_words, settings_of
 from neuralq.doctor.findings import Cause, Finding
-from neuralq.doctor.play import returns_from
 from neuralq.runs import train
 from neuralq.runs.recipe.stand_in import Maker
 from neuralq.runs.sweep.statistics import interquartile_mean
-from neuralq.types import Array, Floats
+from neuralq.types import Floats
 
 __all__ = ["Experiments", "fit", "run_experiments"]
 
@@ -98,7 +98,7 @@ def fit(case: Case, seeds: int = 3) -> Finding:
     network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
     if network is None or encode is None or outputs is None:
         raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
-    s, a, g, names = _labelled(case)
+    s, a, g, names = labelled(case, 4000)
     x = case.world.as_rows(s)
     if x.shape[1] > 2000:
         raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
@@ -108,13 +108,12 @@ def fit(case: Case, seeds: int = 3) -> Finding:
     for seed in range(max(seeds, 3)):
         rng = case.rng(70 + seed)
         held = np.isin(names, rng.permutation(np.unique(names))[: max(len(np.unique(names)) // 3, 1)])
-        own = _regressed(fresh(network, rng), lambda net: outputs(net, theirs), a, g, held, rng)
-        better = _regressed(
-            _our_body(ours.shape[1], case.world.num_actions, rng), lambda net: net(ours), a, g, held, rng
-        )
+        own = regressed(fresh(network, rng), outputs, theirs, a, g, held, rng)
+        body = _our_body(ours.shape[1], case.world.num_actions, rng)
+        better = regressed(body, lambda net, rows: net(rows), ours, a, g, held, rng)
         gaps.append(better - own)
         scores.append((own, better))
-    low, high = _t_interval(gaps)
+    low, high = t_interval(gaps)
     own, better = np.mean(scores, axis=0)
     return Finding(
         "X2", "the network cannot represent the returns", "representation", "A", float(np.mean(gaps)), (low, high),
@@ -128,55 +127,11 @@ def fit(case: Case, seeds: int = 3) -> Finding:
     )  # fmt: skip
 
 
-def _labelled(case: Case) -> tuple[Array, Array, Floats, Array]:
-    """s, a and G of steps whose return is known, and of which episode they are; at most 4,000."""
-    rows = []
-    for i, one in enumerate((*case.greedy, *case.explored)):
-        g = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
-        if len(g):
-            rows.append((one.observations[: len(g)], one.actions[: len(g)], g, np.full(len(g), i)))
-    if len(rows) < 9:
-        raise CannotMeasure("fewer than 9 episodes have steps whose return is known")
-    s, a, g, names = (np.concatenate([row[k] for row in rows]) for k in range(4))
-    if g.std() < 1e-9:
-        raise CannotMeasure("all returns are the same, so that there is nothing to represent")
-    pick = case.rng(69).permutation(len(g))[:4000]
-    return s[pick], a[pick], g[pick], names[pick]
-
-
 def _our_body(width: int, num_actions: int, rng: np.random.Generator) -> nn.Module:
     layers: list[nn.Module] = []
     for below, above in zip((width, *_OUR_HIDDEN), _OUR_HIDDEN, strict=False):
         layers += [nn.Linear(below, above), nn.LayerNorm(above), nn.ReLU()]
     return fresh(nn.Sequential(*layers, nn.Linear(_OUR_HIDDEN[-1], num_actions)), rng)
-
-
-def _regressed(
-    net: nn.Module, values: Callable[[nn.Module], Tensor], a: Array, g: Floats, held: Array, rng: np.random.Generator
-) -> float:
-    """R² on the held-out rows after 400 Adam steps on the others."""
-    target = torch.as_tensor((g - g[~held].mean()) / max(float(g[~held].std()), 1e-12)).float()
-    chosen, learn = torch.as_tensor(a)[:, None], torch.as_tensor(np.flatnonzero(~held))
-    optimiser = torch.optim.Adam(net.parameters(), lr=1e-3)
-    for _ in range(400):
-        error = ((values(net).gather(1, chosen)[:, 0] - target)[learn] ** 2).mean()
-        optimiser.zero_grad()
-        torch.autograd.backward(error)
-        nn.utils.clip_grad_norm_(net.parameters(), 10.0)
-        optimiser.step()
-    with torch.no_grad():
-        left = (values(net).gather(1, chosen)[:, 0] - target)[torch.as_tensor(held)].double()
-    variance = float(target[torch.as_tensor(held)].double().var(correction=0))
-    return max(1.0 - float((left**2).mean()) / max(variance, 1e-12), -1.0)
-
-
-def _t_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Of the mean, by Student's t over seeds."""
-    from scipy.stats import t
-
-    n = len(values)
-    half = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / np.sqrt(n)
-    return float(np.mean(values) - half), float(np.mean(values) + half)
 
 
 # X3 and X1

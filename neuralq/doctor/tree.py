@@ -17,34 +17,13 @@ from neuralq.doctor.findings import UNEXPLAINED, Finding
 
 __all__ = ["decide"]
 
-_ORDER = (
-    *(
-        "X3",
-        "X2",
-        "X1",
-        "NaN",
-        "E1",
-        "E3",
-        "E6",
-        "R6a",
-        "D1",
-        "D2",
-        "D5",
-        "E4",
-        "E5",
-        "D3",
-        "D4",
-        "R1",
-        "V5",
-        "V3",
-        "V4",
-        "V7a",
-        "V2",
-    ),
-    *("V6a", "V7", "V1", "R3", "R6", "E2", "V6", "V3a", "V8", "R2", "R4", "R5"),
+_ORDER = tuple(
+    "X3 X2 X1 NaN E1 E3 E6 R6a D1 D2 D5 E4 E5 D3 D4 R7 R1 V5 V3 V4 V7a V2 V6a V7 V1 R3 R6 E2 V6 V3a V8 R2 R4 R5".split()
 )
-_CERTAIN = {"E1", "E3", "E6", "D1", "D2", "D5", "V7", "V7a", "V6a"}
+_CERTAIN = {"E1", "E3", "E6", "D1", "D2", "D5", "V7", "V7a"}
 """What stays a finding although the policy has learned and its values are right."""
+_FAR_BEYOND = 1.3
+"""V4 up to which right values on the average are right: a few states may be extreme; our own."""
 _FAR_OFF = {"E4": 100.0, "E5": 1e4}
 """Beyond these a scale is no vital sign but a cause, where values or policy are bad; our own."""
 
@@ -70,7 +49,8 @@ def _is_well(by_id: Mapping[str, Finding]) -> bool:
     """Whether the policy has learned and its values are right."""
     has_learned = "V1" in by_id and not by_id["V1"].flagged
     exact = "V7" in by_id and not by_id["V7"].flagged
-    right = all(not by_id[name].flagged for name in ("V2", "V4", "V7a") if name in by_id)
+    right = all(not by_id[name].flagged for name in ("V2", "V7a") if name in by_id)
+    right = right and not ("V4" in by_id and by_id["V4"].flagged and not by_id["V4"].value < _FAR_BEYOND)
     return (has_learned or exact) and right and ("V2" in by_id or exact)
 
 

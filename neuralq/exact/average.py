@@ -17,7 +17,7 @@ several classes, and then the gain may depend on where one starts. What ends an 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -190,8 +190,7 @@ def _policy_iteration(
     problem: PlanningProblem, tol: float, limit: int
 ) -> tuple[NDArray[np.int64], Floats, Floats, int, float]:
     mdp, states = problem.mdp, np.flatnonzero(problem.acts)
-    still = problem.rows._replace(reward=np.zeros(mdp.num_rows))
-    moves = PlanningProblem(mdp, 1.0, still, problem.acts, np.inf, 0.0, problem.longest, 0.0)
+    moves = replace(problem, rows=problem.rows._replace(reward=np.zeros(mdp.num_rows)))
     rows, iterations = best_rows(problem, mdp.reward), 0
     while True:
         policy = np.where(mdp.is_terminal, -1, mdp.a_tm1[rows])

@@ -148,7 +148,7 @@ class LearnerKind:
         Example:
             >>> kind = learner_kinds()["online"]
             >>> kind.settings_for("table", {}).step_size, kind.settings_for("linear", {}).step_size
-            (0.05, 0.001)
+            (0.1, 0.001)
             >>> kind.settings_for("table", {"step_size": 0.5}).step_size
             0.5
         """

@@ -225,10 +225,12 @@ def _build(parts: Parts) -> RolloutLearner:
 
 
 def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain steps that bring an entry a tenth nearer to each target of it, in small minibatches, and fall to 0.
+    """Plain steps that bring an entry by 0.03 of the way to each target of it, in small minibatches, and fall to 0.
 
-    An entry that all B samples of a minibatch are of moves by B tenths at most, which is kept below 1.
+    An entry that all B samples of a minibatch are of moves by 0.03 B of the way at most, which is kept below 1.
     """
+    if given.get("optimiser", "sgd") != "sgd":
+        return {}
     num_envs, num_steps = given.get("num_envs", 8), given.get("num_steps", 32)
     rows = max(1, num_envs * num_steps)
     minibatches = given.get("num_minibatches", max(1, rows // 8))
@@ -237,7 +239,7 @@ def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
         "num_steps": num_steps,
         "num_minibatches": minibatches,
         "optimiser": "sgd",
-        "learning_rate": min(1.0, 0.1 * rows / max(1, minibatches)),
+        "learning_rate": min(1.0, 0.03 * rows / max(1, minibatches)),
         "max_grad_norm": None,
         "anneal": True,
         "returns": "watkins",

@@ -185,7 +185,8 @@ def _another_gamma(case: Case, other: float) -> _Hypothesis:
     return _Hypothesis(
         f"γ = {other:g}", "gamma", lambda one: _whole(one, other),
         f"γ = {case.gamma:g} was declared, and the values are those of γ = {other:g}: use one and the same; "
-        "values whose training is not over yet look the same: train longer, and see whether they grow",
+        "values whose training is not over yet look the same: train longer, and see whether they grow"
+        + ("" if case.world.limit is None else "; so do those of a learner that takes the time limit for the end"),
         f"neuralq train {case.world.name} --learner replay --gamma {case.gamma:g}", (1.0, other),
     )  # fmt: skip
 

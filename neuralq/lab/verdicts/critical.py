@@ -276,7 +276,7 @@ def _or_nan(margin: Callable[[float], float], value: float) -> float:
 
 def _crossings(margin: Callable[[float], float], values: Floats, margins: Floats) -> tuple[float, ...]:
     """Every zero of a continuous margin, also pairs of them between two points of the scan."""
-    knots = list(zip(values.tolist(), margins.tolist(), strict=True))
+    knots = list(zip(values.tolist(), (margins > 0).tolist(), strict=True))  # and whether it is stable there
     size = np.abs(margins)
     for i in range(1, len(values) - 1):
         # A dip towards zero that does not reach it at the points may do so in between.
@@ -287,10 +287,10 @@ def _crossings(margin: Callable[[float], float], values: Floats, margins: Floats
                 lambda x, sign=sign: sign * margin(x), bounds=(values[i - 1], values[i + 1]), method="bounded"
             )
             if least.fun < 0:
-                knots.append((float(least.x), float(sign * least.fun)))
+                knots.append((float(least.x), bool(sign < 0)))
     knots.sort()
     found = []
-    for (low, at_low), (high, at_high) in itertools.pairwise(knots):
-        if (at_low > 0) != (at_high > 0):
+    for (low, stable_low), (high, stable_high) in itertools.pairwise(knots):
+        if stable_low != stable_high:
             found.append(float(brentq(margin, low, high, xtol=1e-15, rtol=4e-15)))
     return tuple(found)

@@ -18,7 +18,7 @@ import numpy as np
 from neuralq.lab.linear.spectrum import limit_of, moving_spectrum
 from neuralq.lab.methods import Expected
 from neuralq.lab.methods.record import Piece
-from neuralq.lab.verdicts.words import Region
+from neuralq.lab.verdicts.words import MOST_REGIONS, Region
 from neuralq.types import Floats
 
 __all__ = ["Path", "follow"]
@@ -28,7 +28,6 @@ CAP = 1e12
 """A run has diverged when it is this many times as large as its start (at least 1)."""
 
 MOST_LEAP = 40  # 2^40 applications: factors of 1 + 1e-16 still count as 1
-MOST_REGIONS = 64
 SETTLED = 1e-12
 
 
@@ -55,7 +54,7 @@ class _Walk:
     def __init__(self, expected: Expected, theta: Floats, step_size: float) -> None:
         self.expected, self.alpha = expected, step_size
         self.theta, self.piece = theta, expected.at(theta, step_size)
-        self.cap = CAP * max(1.0, float(np.abs(theta).max(initial=0.0)))
+        self.cap = CAP * float(np.abs(theta).max(initial=1.0))
         self.met: dict[bytes, tuple[Piece, Floats]] = {}
         self.meet()
 
@@ -69,6 +68,9 @@ class _Walk:
     def same(self, theta: Floats) -> bool:
         M, c = self.expected.at(theta, self.alpha)
         return np.array_equal(M, self.piece[0]) and np.array_equal(c, self.piece[1])
+
+    def escapes(self, theta: Floats) -> bool:
+        return bool((np.abs(theta) > self.cap).any())
 
     def leap(self) -> int:
         """Apply the piece for as long as it stays, by doubling; the number of doublings."""
@@ -86,7 +88,7 @@ class _Walk:
                 self.theta = theta
                 return k
             theta, before = ahead, half
-            if np.abs(theta).max() > self.cap:
+            if self.escapes(theta):
                 break
         self.theta = theta
         return MOST_LEAP
@@ -130,28 +132,26 @@ def follow(expected: Expected, theta: Floats, step_size: float, num_steps: int =
             if not stays and moved <= SETTLED * largest:  # before numbers underflow, and with them the piece
                 return Path("converges", walk.theta, walk.piece, walk.regions())
             far = MOST_LEAP if moved == 0 else walk.leap() if stays else 0
-            if np.abs(walk.theta).max(initial=0.0) > walk.cap:
-                return Path("diverges", walk.theta, walk.piece, walk.regions())
-            if far == MOST_LEAP:  # a trillion applications and still the same piece: this is where it stays
-                return Path(_resting(walk), walk.theta, walk.piece, walk.regions())
             if far == 0:
                 walk.theta = ahead
                 if not stays:
                     walk.piece = expected.at(ahead, step_size)
                     walk.meet()
-            if np.abs(walk.theta).max(initial=0.0) > walk.cap:
+            if walk.escapes(walk.theta):
                 return Path("diverges", walk.theta, walk.piece, walk.regions())
+            if far == MOST_LEAP:  # a trillion applications and still the same piece: this is where it stays
+                return Path(_resting(walk), walk.theta, walk.piece, walk.regions())
             places.append(walk.theta)
     return Path(_wandering(np.array(places)), walk.theta, walk.piece, walk.regions())
 
 
 def _resting(walk: _Walk) -> Literal["converges", "undecided"]:
-    """A run that stays in its piece without growing has converged, unless a mode of factor 1 still carries it."""
+    """A run that stays in its piece without growing has converged, unless a mode of modulus 1 still carries it."""
     M, c = walk.piece
     step = np.abs(M @ walk.theta + c - walk.theta).max(initial=0.0)
-    still = step <= SETTLED * max(1.0, float(np.abs(walk.theta).max(initial=0.0)))
-    drifts = limit_of(np.eye(len(c)) - M, c, walk.theta).drift.any()
-    return "converges" if still and not drifts else "undecided"
+    still = step <= SETTLED * np.abs(walk.theta).max(initial=1.0)
+    carried = limit_of(np.eye(len(c)) - M, c, walk.theta).theta is None  # so slowly that each step looks like rounding
+    return "converges" if still and not carried else "undecided"
 
 
 def _wandering(places: Floats) -> Literal["converges", "diverges", "chatters", "undecided"]:
@@ -159,7 +159,7 @@ def _wandering(places: Floats) -> Literal["converges", "diverges", "chatters", "
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     late = len(steps) // 2
     first, last = float(np.median(steps[late : late + late // 4])), float(np.median(steps[-(late // 4) :]))
-    size = max(1.0, float(np.abs(places[-1]).max()))
+    size = float(np.abs(places[-1]).max(initial=1.0))
     if last <= SETTLED * size or last < 0.5 * first:
         return "converges"
     if last > 2 * first:

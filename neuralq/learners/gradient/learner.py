@@ -20,12 +20,14 @@ action cuts it *before* its own gradient is added, it is dropped *after* the las
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuralq import rules
 from neuralq.learners import state
+from neuralq.learners.annealing import LinearFall
 from neuralq.learners.gradient.correction import Correction
 from neuralq.learners.gradient.differentiation import greedy_value
 from neuralq.learners.gradient.step import GradientStep, GradientTDSettings, TDStep
@@ -137,6 +139,7 @@ class GradientQLearner:
         num_envs: parallel streams N, one row of every transition each; with λ = 0 any number of rows will do.
         reward_scale: rewards are multiplied by it, so values are too.
         policy: target policy from action values to probabilities, not differentiated; None for the greedy one.
+        total_steps: environment steps over which both step sizes fall linearly to 0; None for constant ones.
 
     Raises:
         ValueError: for a ``policy`` with ``cut="naive"``: its traces are cut by the importance ratio.
@@ -165,6 +168,7 @@ class GradientQLearner:
         num_envs: int = 1,
         reward_scale: float = 1.0,
         policy: Callable[[Tensor], Tensor] | None = None,
+        total_steps: int | None = None,
     ) -> None:
         if policy is not None and settings.cut != "watkins":
             raise ValueError("with a target policy the importance ratio cuts the traces; leave cut at its default")
@@ -174,7 +178,10 @@ class GradientQLearner:
         self.policy = policy
         self.num_updates = 0
         self._core = GradientStep(engine, correction, settings, num_envs)
-        self._parts = {"parameters": engine.flat, "h": correction.values, "traces": self._core.traces}
+        self._parts: dict[str, Any] = {"parameters": engine.flat, "h": correction.values, "traces": self._core.traces}
+        self._fall = None if total_steps is None else LinearFall(total_steps, engine.flat.values)
+        if self._fall is not None:
+            self._parts["fall"] = self._fall
 
     @property
     def engine_name(self) -> str:
@@ -215,6 +222,9 @@ class GradientQLearner:
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from one step of every environment, ``[N]``; increments are summed, rows of weight 0 did not move."""
         increment, increment_h, seen = self.increments(transition, weight)
+        if self._fall is not None:
+            share = self._fall.advance(torch.ones_like(seen.errors) if weight is None else weight)
+            increment, increment_h = share * increment, share * increment_h
         self.engine.flat.values.add_(increment)
         self._core.correction.values.add_(increment_h)
         self.num_updates += 1

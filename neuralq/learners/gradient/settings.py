@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -10,6 +11,7 @@ import torch
 from torch import nn
 
 from neuralq.checks import check_choice, check_fraction, check_positive
+from neuralq.learners.annealing import falls_over
 from neuralq.learners.gradient.correction import HeadCorrection, TangentCorrection
 from neuralq.learners.gradient.learner import GradientQLearner
 from neuralq.learners.gradient.step import GradientTDSettings
@@ -46,6 +48,7 @@ class GradientSettings:
         target_epsilon: ε of gq's ε-greedy target policy; None for 0, the greedy one.
         normalise_observations: by their running mean and spread; None does so unless they are state indices.
         scale_rewards: by the running spread of their discounted sum.
+        anneal: whether both step sizes fall linearly to 0 over the run's steps.
 
     Raises:
         ValueError: for values outside their range, or that the method has no use for.
@@ -70,6 +73,7 @@ class GradientSettings:
     target_epsilon: float | None = None
     normalise_observations: bool | None = None
     scale_rewards: bool = True
+    anneal: bool = False
 
     def __post_init__(self) -> None:
         """Fill in what is left out; refuse values outside their range and those that would be ignored."""
@@ -117,7 +121,11 @@ def started_at_zero(q: QFunction) -> QFunction:
 
 
 def gradient_learner(
-    engine: Engine, settings: GradientSettings, head: QFunction, reward_scale: float = 1.0
+    engine: Engine,
+    settings: GradientSettings,
+    head: QFunction,
+    reward_scale: float = 1.0,
+    total_steps: int | None = None,
 ) -> GradientQLearner:
     """QRC(λ) with ``head`` for its second function; GQ(λ) finds its own in the tangent space of the values.
 
@@ -127,14 +135,23 @@ def gradient_learner(
         >>> gradient_learner(TorchEngine(TableQ(2, 2), Loss()), GradientSettings(), TableQ(2, 2)).num_updates
         0
     """
+    steps = falls_over(settings, total_steps)
     if settings.method == "qrc":
-        return GradientQLearner(engine, HeadCorrection(head), settings.rule, 1, reward_scale)
+        head_correction = HeadCorrection(head)
+        return GradientQLearner(engine, head_correction, settings.rule, 1, reward_scale, total_steps=steps)
     policy = partial(epsilon_greedy, epsilon=settings.target_epsilon or 0.0)
-    return GradientQLearner(engine, TangentCorrection(engine), settings.rule, 1, reward_scale, policy)
+    return GradientQLearner(engine, TangentCorrection(engine), settings.rule, 1, reward_scale, policy, steps)
 
 
 def _build(parts: Parts) -> GradientQLearner:
-    return gradient_learner(parts.engine, parts.settings, started_at_zero(parts.another()), parts.reward_scale)
+    head = started_at_zero(parts.another())
+    return gradient_learner(parts.engine, parts.settings, head, parts.reward_scale, parts.total_steps)
+
+
+def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Large steps that fall to 0, with short traces: with long ones some runs never leave the start of CliffWalking."""
+    short = {"lambda_": 0.3} if given.get("method", "qrc") == "qrc" else {}
+    return {"step_size": 0.1, "anneal": True, **short}
 
 
 def _check(settings: GradientSettings, representation: Representation) -> None:
@@ -156,4 +173,5 @@ GRADIENT = LearnerKind(
     check=_check,
     place=5,
     step_sizes=("step_size", "step_size_h"),
+    on_table=_on_table,
 )

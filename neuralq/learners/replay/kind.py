@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.noisy import made_noisy
 from neuralq.rules.one_step import DOUBLE
+from neuralq.rules.target_rule import target_rules
 from neuralq.types import QFunction
 
 __all__ = ["REPLAY"]
@@ -70,6 +73,30 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
+def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain steps that bring an entry a twentieth nearer to each of its samples, all of them kept; an average plays.
+
+    A step moves no other entry, so that targets need no frozen copy. An entry that all samples of a batch are of moves
+    by 1.6 of the way at most, which still brings it nearer.
+    """
+    rule = target_rules().get(given.get("target_rule", ""))
+    learns_means = given.get("distribution", MEAN.name) == MEAN.name and not (rule is not None and rule.correction)
+    if not learns_means or given.get("optimiser", "sgd") != "sgd":
+        return {}
+    rows = given.get("batch_size", max(32, given.get("block_length", 1)))
+    frozen = {} if given.get("target_period_updates") is not None else {"target_rate": 1.0}
+    return frozen | {
+        "optimiser": "sgd",
+        "learning_rate": min(1.6, 0.05 * max(1, rows)),
+        "loss": "squared",
+        "max_grad_norm": None,
+        "batch_size": rows,
+        "train_period": 2,
+        "capacity": 100_000,
+        "average_updates": 5_000.0,
+    }
+
+
 REPLAY = LearnerKind(
     name="replay",
     title="Q-learning from stored experience, with a target network (DQN)",
@@ -91,4 +118,5 @@ REPLAY = LearnerKind(
     check=_check,
     place=2,
     step_sizes=("learning_rate", "dqrc_learning_rate"),
+    on_table=_on_table,
 )

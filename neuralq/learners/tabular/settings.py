@@ -50,8 +50,8 @@ class TabularSettings:
 
     Args:
         algorithm: "q-learning", "sarsa", "expected-sarsa", "double", "n-step", "q-lambda", "dyna",
-            "prioritized-sweeping", "td-lambda" (values of the states under the random policy) or "r-learning" (reward
-            per step, in worlds without end).
+            "prioritized-sweeping", "td-lambda" (values of the states under the random policy; of others:
+            `neuralq.tabular.td_lambda`) or "r-learning" (reward per step, in worlds without end).
         simulate: whether the environment's model is simulated inside the compiled loop; none where it has one that does
             what the environment does, else the environment is stepped.
         schedule: of the step size α by visits n of a pair: "constant", "one-over-n" (1/n), "power" (1/n^ω) or
@@ -129,8 +129,8 @@ class TabularSettings:
     def _check_goes_together(self, plan: dict[str, Any]) -> None:
         if self.algorithm == "td-lambda" and plan["policy"] != "random":
             raise ValueError(
-                f"td-lambda predicts what the random policy earns, got policy={self.policy!r}; leave policy out, or "
-                "choose an algorithm that learns to act"
+                f"td-lambda predicts what the random policy earns, got policy={self.policy!r}; leave policy out, "
+                "predict another with neuralq.tabular.td_lambda and under_policy, or choose an algorithm that acts"
             )
         expects = self.algorithm == "expected-sarsa" or plan["rule"] == "expected-sarsa"
         if expects and plan["policy"] == "ucb":

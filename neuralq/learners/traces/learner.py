@@ -9,6 +9,7 @@ the last step of a stream. With values held fixed over an episode the increments
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.checks import check_choice, check_fraction, check_positive
 from neuralq.learners import state
+from neuralq.learners.annealing import LinearFall, falls_over
 from neuralq.learners.kind import LearnerKind, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.traces.memory import Traces
@@ -37,12 +39,14 @@ class OnlineSettings:
         trace: "accumulating", "replacing" (Singh & Sutton, 1996), or "dutch" with the true online increment (van Seijen
             & Sutton, 2014), which is defined for tables and linear features only.
         cut: "watkins" drops the trace at exploring actions, "naive" never does. Control only.
+        anneal: whether the step size falls linearly to 0 over the run's steps. Control only.
     """
 
     lambda_: float = 0.8
     step_size: float = 1e-3
     trace: str = "accumulating"
     cut: str = "watkins"
+    anneal: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
@@ -52,6 +56,8 @@ class OnlineSettings:
         check_choice("cut", self.cut, ("watkins", "naive"))
         if self.trace == "dutch" and self.cut == "naive":
             raise ValueError("the true online increment is not derived for uncut Q(λ); leave cut='watkins'")
+        if self.trace == "dutch" and self.anneal:
+            raise ValueError("dutch traces are derived for a constant step size; leave anneal out")
 
 
 class _Core:
@@ -127,9 +133,10 @@ class OnlineLearner:
         settings: how to learn.
         num_envs: parallel environments N; row i of every transition is environment i.
         reward_scale: rewards are multiplied by it, so values are too.
+        total_steps: environment steps over which the step size falls, where it does.
 
     Raises:
-        ValueError: for dutch traces on a network.
+        ValueError: for dutch traces on a network, and a step size that falls over no number of steps.
 
     Example:
         >>> from neuralq.q.engine import Loss, TorchEngine
@@ -145,13 +152,24 @@ class OnlineLearner:
         [4.0, 8.0, 0.0]
     """
 
-    def __init__(self, engine: Engine, settings: OnlineSettings, num_envs: int = 1, reward_scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        settings: OnlineSettings,
+        num_envs: int = 1,
+        reward_scale: float = 1.0,
+        total_steps: int | None = None,
+    ) -> None:
         self.engine = engine
         self.settings = settings
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._core = _Core(engine, settings, num_envs, 1)
-        self._parts = {"parameters": engine.flat, "traces": self._core.traces}
+        self._parts: dict[str, Any] = {"parameters": engine.flat, "traces": self._core.traces}
+        steps = falls_over(settings, total_steps)
+        self._fall = None if steps is None else LinearFall(steps, engine.flat.values)
+        if self._fall is not None:
+            self._parts["fall"] = self._fall
 
     def increment(self, transition: Transition, weight: Tensor | None = None) -> tuple[Tensor, Update]:
         """What `update` would add to the weights ``[d]``; the traces move on, the weights do not."""
@@ -169,6 +187,8 @@ class OnlineLearner:
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """Learn from one step of every environment, ``[N]``; environments of weight 0 did not move."""
         total, seen = self.increment(transition, weight)
+        if self._fall is not None:
+            total = total * self._fall.advance(torch.ones_like(seen.errors) if weight is None else weight)
         self.engine.flat.values.add_(total)
         self.num_updates += 1
         return seen
@@ -185,11 +205,11 @@ class PredictionLearner:
 
     Args:
         engine: values and gradients of the representation.
-        settings: how to learn; ``cut`` has no meaning for prediction and must stay at its default.
+        settings: how to learn; ``cut`` and ``anneal`` have no meaning for prediction and must stay at their defaults.
         num_envs: parallel streams N; row i of every transition is environment i.
 
     Raises:
-        ValueError: for dutch traces on a network, or a ``cut`` that is not the default.
+        ValueError: for dutch traces on a network, or a ``cut`` or ``anneal`` that is not the default.
 
     Example:
         >>> from neuralq.q.engine import Loss, TorchEngine
@@ -204,6 +224,8 @@ class PredictionLearner:
     def __init__(self, engine: Engine, settings: OnlineSettings, num_envs: int = 1) -> None:
         if settings.cut != "watkins":
             raise ValueError("prediction has no exploring actions to cut at; leave cut at its default")
+        if settings.anneal:
+            raise ValueError("prediction has no budget over which its step size could fall; leave anneal out")
         self.engine = engine
         self.settings = settings
         self.num_updates = 0
@@ -248,10 +270,10 @@ ONLINE = LearnerKind(
     title="Q(λ) with eligibility traces, step by step",
     source="Watkins 1989; van Seijen & Sutton 2014",
     settings=OnlineSettings,
-    build=lambda parts: OnlineLearner(parts.engine, parts.settings, 1, parts.reward_scale),
+    build=lambda parts: OnlineLearner(parts.engine, parts.settings, 1, parts.reward_scale, parts.total_steps),
     experience="steps",
     traits=lambda s: Traits(s.step_size, lambda_=s.lambda_),
     place=3,
     step_sizes=("step_size",),
-    on_table=lambda given: {"step_size": 0.05, "lambda_": 0.5},
+    on_table=lambda given: {"step_size": 0.1, "lambda_": 0.5, "anneal": given.get("trace") != "dutch"},
 )

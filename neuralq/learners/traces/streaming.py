@@ -28,6 +28,7 @@ from torch import Tensor
 from neuralq import rules
 from neuralq.checks import check_choice, check_discount, check_fraction, check_positive
 from neuralq.learners import state
+from neuralq.learners.annealing import falls_over
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.traces import streaming_kernels as kernels
@@ -56,6 +57,7 @@ class StreamingSettings:
         cut: "watkins" (exact) or "published" (as Stream Q(λ)'s program does).
         normalise_observations: by their running mean and spread; None does so unless they are state indices.
         scale_rewards: by the running spread of their discounted sum.
+        anneal: whether the step size falls linearly to 0 over the run's steps.
 
     Raises:
         ValueError: for values outside their range, or that the bound has no use for.
@@ -74,6 +76,7 @@ class StreamingSettings:
     cut: str = "watkins"
     normalise_observations: bool | None = None
     scale_rewards: bool = True
+    anneal: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values outside their range and those that would be ignored."""
@@ -121,12 +124,12 @@ class _Steps:
             self._memory: Any = tuple(x.numpy() for x in (values, self.z, self.v, engine.flat.grad, self.means))
             self._decay: Any = self.decay.numpy()
         alpha, kappa, beta2 = settings.eta_or_alpha, settings.overshoot_bound, settings.second_moment_decay
-        self._constants: Any = (_BOUNDS.index(settings.bound), alpha, kappa, beta2, 1.0 - self.gamma_lambda)
+        self._alpha, self._rest = alpha, (kappa, beta2, 1.0 - self.gamma_lambda)
 
-    def advance(self, delta: Tensor, t: int) -> None:
-        """Decay the trace, add ``flat.grad`` and move the weights: step ``t``, from 1."""
+    def advance(self, delta: Tensor, t: int, share: float = 1.0) -> None:
+        """Decay the trace, add ``flat.grad`` and move the weights: step ``t``, from 1, by a share of the step size."""
         settings = self.settings
-        alpha, kappa, beta2 = settings.eta_or_alpha, settings.overshoot_bound, settings.second_moment_decay
+        alpha, kappa, beta2 = share * settings.eta_or_alpha, settings.overshoot_bound, settings.second_moment_decay
         grad = self.engine.flat.grad
         self.z.copy_(rules.accumulate(self.z, grad, self.decay))
         if settings.bound == "obgd":
@@ -142,12 +145,13 @@ class _Steps:
             self.means.copy_(means)
         self.engine.flat.values.add_(step)
 
-    def advance_compiled(self, delta: float, t: int) -> None:
+    def advance_compiled(self, delta: float, t: int, share: float = 1.0) -> None:
         """As `advance`, in two passes over the memory."""
         if self.settings.bound == "intentional" and self.gamma_lambda == 1:  # a mean that the kernel does not keep
-            self.advance(torch.tensor(delta, dtype=self.z.dtype), t)
+            self.advance(torch.tensor(delta, dtype=self.z.dtype), t, share)
             return
-        arguments: Any = (*self._memory, float(self._decay), delta, *self._constants, t)
+        step = (_BOUNDS.index(self.settings.bound), share * self._alpha, *self._rest)
+        arguments: Any = (*self._memory, float(self._decay), delta, *step, t)
         kernels.advance(*arguments)
         if t % _SQUARES_CHECKED_EVERY == 0 and self.settings.bound != "obgd" and not kernels.is_finite(self._memory[2]):
             self.engine.flat.values.fill_(math.nan)
@@ -171,9 +175,10 @@ class StreamingLearner:
         reward_scale: rewards are multiplied by it, so values are too.
         kind: "torch" computes on any device with tensor operations; "auto" and "compiled" on a CPU with compiled
             kernels, altogether for `ActionOutputQ`, elsewhere for the step along the trace.
+        total_steps: environment steps over which the step size falls, where it does.
 
     Raises:
-        ValueError: for "compiled" on another device.
+        ValueError: for "compiled" on another device, and a step size that falls over no number of steps.
 
     Example:
         >>> from neuralq.q import TableQ
@@ -196,6 +201,7 @@ class StreamingLearner:
         discount: float = 0.99,
         reward_scale: float = 1.0,
         kind: str = "auto",
+        total_steps: int | None = None,
     ) -> None:
         check_discount("discount", discount)
         check_choice("kind", kind, ("auto", "torch", "compiled"))
@@ -207,9 +213,15 @@ class StreamingLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self._steps = _Steps(engine, settings, discount)
+        self._falls_over = falls_over(settings, total_steps)
         self._parts = {"parameters": engine.flat, "steps": self._steps}
         self._compiled = kind != "torch" and on_cpu
         self._network = SingleRowNetwork(engine) if self._compiled and runs_single_row(engine.q) else None
+
+    @property
+    def _share(self) -> float:
+        """Of the step size, at the next update; each is a step."""
+        return 1.0 if self._falls_over is None else max(0.0, 1.0 - self.num_updates / self._falls_over)
 
     @property
     def engine_name(self) -> str:
@@ -254,7 +266,7 @@ class StreamingLearner:
         if exact:
             steps.z.copy_(rules.cut(steps.z, ~greedy))
         delta = target - value
-        steps.advance(delta, self.num_updates + 1)
+        steps.advance(delta, self.num_updates + 1, self._share)
         last = transition.last_t[0]
         steps.z.copy_(rules.cut(steps.z, last if exact else last | ~greedy))
         steps.decay.copy_(transition.discount_t[0] * self.settings.lambda_)
@@ -273,7 +285,7 @@ class StreamingLearner:
         if exact and not greedy:
             steps.z.zero_()
         delta = target - value
-        steps.advance_compiled(delta, self.num_updates + 1)
+        steps.advance_compiled(delta, self.num_updates + 1, self._share)
         if transition.last_t.item() or not (exact or greedy):
             steps.z.zero_()
         steps.decay.fill_(discount_t * self.settings.lambda_)
@@ -287,7 +299,9 @@ class StreamingLearner:
 
 def _build(parts: Parts) -> StreamingLearner:
     kernels = "auto" if parts.kernels == "compiled" else parts.kernels  # on other devices torch stands in
-    return StreamingLearner(parts.engine, parts.settings, parts.discount, parts.reward_scale, kernels)
+    return StreamingLearner(
+        parts.engine, parts.settings, parts.discount, parts.reward_scale, kernels, parts.total_steps
+    )
 
 
 STREAMING = LearnerKind(
@@ -301,4 +315,5 @@ STREAMING = LearnerKind(
     normalises=lambda s: (s.normalise_observations, s.scale_rewards),
     place=4,
     step_sizes=("step_size",),
+    on_table=lambda given: {"step_size": 0.1, "lambda_": 0.5, "anneal": True},
 )

@@ -172,7 +172,9 @@ def _lead(rows: Sequence[Row], summary: Mapping[str, Any], target: float | None)
         return _measured(rows) or "No greedy evaluation has been recorded yet."
     text = f"After {steps[-1]:,.0f} environment steps the greedy policy scores {returns[-1]:.4g} per episode."
     if (kept := kept_words(summary)) is not None:
-        text = f"The agent that was kept scores {kept[0]} per episode ({kept[1]}). {text}"
+        text = f"The agent that was kept scores {kept[0]} per episode ({kept[1]}). " + text.replace(
+            "the greedy policy scores", "the last evaluation scored"
+        )
     if target is None:
         return text
     reached = steps[returns >= target]

@@ -29,6 +29,7 @@ __all__ = ["MAX_TABLE_STATES", "Encoder", "ObservationError", "Part", "discrete_
 MAX_TABLE_STATES = 10_000_000
 """The most states that a table is built for; beyond it a table is no longer the right representation."""
 
+_LAYOUTS = "choose another layout (linear, action-input, separate, action-output)"
 _FLOAT, _WHOLE, _BINARY, _FRAMES = "f", "iu", "biu", (np.uint8, np.bool_)
 _KIND_WORDS = {_FLOAT: "floating-point", _WHOLE: "whole-number", _BINARY: "0/1", "b": "boolean"}
 
@@ -286,13 +287,14 @@ class Encoder:
         return lengths[0]
 
 
-def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False) -> Encoder:
+def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False, instead: str = _LAYOUTS) -> Encoder:
     """The encoder of an observation space: arrays for networks and linear features, or one state index for a table.
 
     Args:
         space: the space of a single environment (``envs.single_observation_space``).
         as_index: encode as one whole number; only for finite spaces.
         wide: numbers as float64 and not scaled, for whoever normalises them before they become float32; frames too.
+        instead: what to choose where no index exists.
 
     Raises:
         ValueError: the space has no batched form or holds nothing, or no index exists (a `Box`, or more than
@@ -313,7 +315,7 @@ def encoder_for(space: Space[Any], *, as_index: bool = False, wide: bool = False
     if wide:
         numbers, parts = np.dtype(np.float64), tuple(replace(part, scaling=None) for part in parts)
     if as_index:
-        return Encoder((), np.dtype(np.int64), _count_states(space, parts), "index", parts)
+        return Encoder((), np.dtype(np.int64), _count_states(space, parts, instead), "index", parts)
     if isinstance(space, spaces.Discrete):
         return Encoder((), np.dtype(np.int64), int(space.n), "index", parts)
     if isinstance(space, spaces.Box):
@@ -359,17 +361,16 @@ def _discrete_part(
     return Part(keys, shape, kinds, dtype, tuple(limits.tolist()), starts.astype(np.int64), limits, columns)
 
 
-def _count_states(space: Space[Any], parts: tuple[Part, ...]) -> int:
-    way_out = "choose another layout (linear, action-input, separate, action-output)"
+def _count_states(space: Space[Any], parts: tuple[Part, ...], instead: str) -> int:
     for part in parts:
         if part.sizes is None:
             place = f" in {_name(part.keys)}" if part.keys else ""
             problem = f"a table needs a finite observation space, got a Box{place}: {space}"
-            raise ValueError(f"{problem}; {way_out} or discretise it with gymnasium.wrappers.TransformObservation")
+            raise ValueError(f"{problem}; {instead} or discretise it with gymnasium.wrappers.TransformObservation")
     num_states = math.prod(size for part in parts for size in part.sizes or ())
     if num_states > MAX_TABLE_STATES:
         problem = f"a table of {num_states:,} states is refused (the most is {MAX_TABLE_STATES:,}) for {space}"
-        raise ValueError(f"{problem}; {way_out} or merge states")
+        raise ValueError(f"{problem}; {instead} or merge states")
     return num_states
 
 

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
 from neuralq.exact import evaluate
+from neuralq.learners.kind import learner_kinds
 from neuralq.learners.learner import Learner, Update
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.mdp import FiniteMDP
@@ -58,7 +59,7 @@ class TableWalk:
         self, env: gym.Env[Any, Any], discount: float, seed: int, simulate: bool | None, reward_scale: float = 1.0
     ) -> None:
         self.envs, self.discount, self._scale = env, discount, reward_scale
-        self.encoder: Encoder = encoder_for(env.observation_space, as_index=True)
+        self.encoder: Encoder = encoder_for(env.observation_space, as_index=True, instead=_other_learners())
         self.num_actions, self._first_action = discrete_actions(env.action_space)
         self._read = _reader(env.observation_space, self.encoder)
         self._seed: int | None = seed
@@ -291,6 +292,12 @@ class TableWalk:
         if any(self.envs.has_wrapper_attr(name) for name in MASK_METHODS):
             return lambda extras: legal_actions(self.envs, extras)
         return lambda extras: extras.get("action_mask")
+
+
+def _other_learners() -> str:
+    """What whoever wanted a table where there is none may do, in words."""
+    others = [name for name, kind in learner_kinds().items() if kind.experience != "table"]
+    return f"choose another learner ({', '.join(others)}), whose networks need no table,"
 
 
 def _time_limit(env: gym.Env[Any, Any]) -> int | None:
