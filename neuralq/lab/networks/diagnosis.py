@@ -163,7 +163,8 @@ class NetworkDiagnosis:
 _EVEN = 1e-12
 _CAVEAT = (
     "All this is local: it was computed at the present weights and holds while they stay near; make it again along "
-    "training."
+    "training. It decides little: of fresh networks on random problems 56% diverged after 'grows', 29% after 'unclear' "
+    "(docs/divergence.md)."
 )
 
 

@@ -73,6 +73,10 @@ class PairLinearQ(nn.Module):
         self.num_actions = num_actions
         self.weight = nn.Parameter(torch.zeros(num_features, dtype=torch.float64))
 
+    def forward(self, s: Tensor) -> Tensor:
+        """`all`, so that ``q(s)`` is what modules are called for."""
+        return self.all(s)
+
     def all(self, s: Tensor) -> Tensor:
         """Action values of every action: ``[*n, A, d] -> [*n, A]``."""
         return s.to(self.weight.dtype) @ self.weight
