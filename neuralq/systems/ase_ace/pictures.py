@@ -99,14 +99,7 @@ def boxes_picture(elements: AseAce) -> Picture:
                 p[:, :, x_dot, x], cmap=red, vmin=lowest, vmax=0, edgecolor="#bbbbbb", linewidth=0.3
             )
             _arrows(axes, w[:, :, x_dot, x], p[:, :, x_dot, x] < 0.6 * lowest)
-            axes.set_xticks(range(7), ["−12", "−6", "−1", "0", "1", "6", "12"], fontsize=7)
-            axes.set_yticks([0.5, 1.5, 2.5], ["left", "slow", "right"], fontsize=7)
-            axes.grid(visible=False)
-            if x_dot == 0:
-                axes.set_title(("x < −0.8 m", "middle", "x > 0.8 m")[x], fontsize=9)
-            if x == 2:
-                axes.yaxis.set_label_position("right")
-                axes.set_ylabel(("ẋ < −0.5 m/s", "slow", "ẋ > 0.5 m/s")[x_dot], fontsize=9)
+            _label(axes, x_dot, x)
         figure.supxlabel("angle of the pole (degrees)", fontsize=9)
         figure.supylabel("where the pole is turning (slow: up to 50 degrees/s)", fontsize=9)
         bar = figure.colorbar(shown, ax=grid, location="top", aspect=40, shrink=0.8)
@@ -125,6 +118,17 @@ def boxes_picture(elements: AseAce) -> Picture:
         "expects a fall. Arrow: the way that is pushed; a dot where it was never told anything."
     )
     return Picture("What both elements learned", svg, caption)
+
+
+def _label(axes: Axes, x_dot: int, x: int) -> None:
+    axes.set_xticks(range(7), ["−12", "−6", "−1", "0", "1", "6", "12"], fontsize=7)
+    axes.set_yticks([0.5, 1.5, 2.5], ["left", "slow", "right"], fontsize=7)
+    axes.grid(visible=False)
+    if x_dot == 0:
+        axes.set_title(("x < −0.8 m", "middle", "x > 0.8 m")[x], fontsize=9)
+    if x == 2:
+        axes.yaxis.set_label_position("right")
+        axes.set_ylabel(("ẋ < −0.5 m/s", "slow", "ẋ > 0.5 m/s")[x_dot], fontsize=9)
 
 
 def _arrows(axes: Axes, weights: NDArray[np.float64], on_dark: NDArray[np.bool_]) -> None:
