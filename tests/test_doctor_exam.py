@@ -481,6 +481,23 @@ def test_exact_regret_is_nothing_for_the_best_values_and_what_it_is_for_others()
     assert exactly.against_optimum(stays).value > 1 and exactly.against_optimum(stays).flagged
 
 
+def test_states_that_are_seen_as_features_are_answered_exactly_too() -> None:
+    """FrozenLake one-hot, twice as large: the values of a row are those of the state behind it."""
+
+    def make() -> gym.Env[Any, Any]:
+        flat = gym.wrappers.FlattenObservation(gym.make("FrozenLake-v1", is_slippery=False))
+        return gym.wrappers.TransformObservation(flat, lambda s: 2.0 * s, spaces.Box(0, 2, (16,), np.float64))
+
+    q = np.nan_to_num(solve(FiniteMDP.from_gymnasium(gym.make("FrozenLake-v1", is_slippery=False)), GAMMA).q)
+    good, wrong = (case_of(make, lambda s, by=by: by + (s / 2) @ q) for by in (0.0, 2.0))
+    assert exactly.regret(good).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(good).value == pytest.approx(0, abs=1e-6)
+    assert exactly.regret(wrong).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(wrong).value == pytest.approx(2.0 / q.max())
+    path = good.greedy[0].observations
+    assert exactly._states(good, path).tolist() == sorted(set(path.argmax(1).tolist()))
+
+
 # The decision.
 
 

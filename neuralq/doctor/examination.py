@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -260,4 +261,7 @@ def _drawn(case: Case) -> dict[str, Array]:
     if not pairs:
         return {}
     points = np.concatenate(pairs)
-    return {"pairs": points[rng.permutation(len(points))[:800]], "starts": np.array(starts)}
+    drawn = {"pairs": points[rng.permutation(len(points))[:800]], "starts": np.array(starts)}
+    with contextlib.suppress(CannotMeasure):
+        drawn |= {f"with {name}": line for name, line in hypotheses.lines(case).items()}
+    return drawn

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -20,18 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["page_of"]
 
 _STYLE = """
-pre { background: #f3f3f3; padding: .5rem .8rem; overflow-x: auto; font-size: .85rem; border-radius: .3rem; }
+pre { background: var(--card); padding: .5rem .8rem; font-size: .85rem; border-radius: .3rem;
+  white-space: pre-wrap; overflow-wrap: anywhere; }
 h3 { font-size: 1rem; margin: 1.4rem 0 .2rem; }
 @media (min-width: 70rem) { .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 1.5rem; } }
-@media (prefers-color-scheme: dark) {
-  :root { color-scheme: dark; }
-  body { background: #16181b; color: #e6e6e6; }
-  .lead, .caption, figcaption, footer { color: #b4b8bd; }
-  .warning { background: #33251b; }
-  pre { background: #24272b; }
-  th, td { border-bottom-color: #3a3e44; }
-  svg.figure { filter: invert(1) hue-rotate(180deg); }
-}
 """
 _GRADES = {"A": "shown by a controlled experiment", "B": "named by a measurement", "C": "a vital sign, no verdict"}
 
@@ -58,9 +51,7 @@ def page_of(report: Report) -> Page:
     _factorial(page, report)
     page.heading("What was not measured, and why")
     if report.not_measured:
-        page.table(
-            html_table("nothing here speaks for or against", ("", "why"), [*map(list, report.not_measured.items())])
-        )
+        page.table(html_table("nothing here speaks for or against", ("", "why"), _by_reason(report.not_measured)))
     else:
         page.paragraph("Everything was measured.")
     rows = [
@@ -71,6 +62,10 @@ def page_of(report: Report) -> Page:
         "Everything that was measured", html_table("", ("", "flagged as", "value", "threshold", "in words"), rows)
     )
     return page
+
+
+def _by_reason(missing: Mapping[str, str]) -> list[list[str]]:
+    return [[", ".join(n for n, why in missing.items() if why == one), one] for one in dict.fromkeys(missing.values())]
 
 
 def _triage(report: Report, cause: Cause) -> list[str]:
@@ -87,8 +82,9 @@ def _found(one: Finding) -> str:
         if one.interval is None
         else f", 95 % from {format_number(one.interval[0])} to {format_number(one.interval[1])}"
     )
+    title, evidence = (escape(text[:1].upper() + text[1:]) for text in (one.title, one.evidence))
     return (
-        f"<h3>{escape(one.title)}</h3>\n<p>{escape(one.evidence[:1].upper() + one.evidence[1:])}.</p>\n<p>{one.id}, "
+        f"<h3>{title}</h3>\n<p>{evidence}.</p>\n<p>{one.id}, "
         f"grade {one.grade} "
         f"({_GRADES[one.grade]}): {format_number(one.value)}{interval}; {escape(_threshold(one))}.</p>\n"
         f"<p>Remedy: {escape(one.remedy)}.</p>\n<p>This would confirm it:</p>\n<pre>{escape(one.confirm)}</pre>"
@@ -110,11 +106,13 @@ def _figures(page: Page, report: Report) -> None:
     pairs, starts = report.drawn.get("pairs"), report.drawn.get("starts")
     if pairs is None or starts is None:
         return
+    lines = {name: line for name, line in report.drawn.items() if name.startswith("with ")}
     page.heading("Values against returns")
     page.figure(
-        _scatter("pairs", pairs[:, 0], pairs[:, 1], "return that followed, discounted", "value Q(s, a)", identity=True),
-        "Each point is a step of a greedy episode: what was returned from there, and what the values said. On the line "
-        "both agree; above it values are too high.",
+        _scatter("pairs", pairs[:, 0], pairs[:, 1], "return that followed, discounted", "value Q(s, a)", lines),
+        "Each point is a step of a greedy episode: what was returned from there, and what the values said. On the "
+        "dotted line both agree; above it values are too high. The other lines are the values of learners with the two "
+        "mistakes that fit best.",
     )
     page.figure(
         _scatter(
@@ -124,14 +122,18 @@ def _figures(page: Page, report: Report) -> None:
     )
 
 
-def _scatter(name: str, x: Floats, y: Floats, below: str, beside: str, identity: bool = False) -> str:
+def _scatter(
+    name: str, x: Floats, y: Floats, below: str, beside: str, lines: Mapping[str, Floats] | None = None
+) -> str:  # fmt: skip
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot(tame(x), tame(y), ".", color=COLOURS[0], alpha=0.5)
-        if identity:
+        if lines is not None:
             ends = np.array([min(float(x.min()), float(y.min())), max(float(x.max()), float(y.max()))])
             axes.plot(tame(ends), tame(ends), color="#555555", linestyle=":", linewidth=1.4, label="value = return")
-            axes.legend()
+            for colour, (label, line) in zip(COLOURS[1:], lines.items(), strict=False):
+                axes.plot(tame(line[:, 0]), tame(line[:, 1]), color=colour, linewidth=1.4, label=label)
+            axes.legend(fontsize="small")
         axes.set_xlabel(below)
         axes.set_ylabel(beside)
 

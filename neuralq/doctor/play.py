@@ -20,7 +20,7 @@ Policy = Callable[[Array, np.random.Generator], tuple[Indices, Floats]]
 """Observations ``[N, *obs]`` to actions ``[N]`` and the action values ``[N, A]`` that they were chosen by (or NaN)."""
 
 _MOST_BYTES = 256 * 2**20
-"""Of observations kept of one policy."""
+"""Of observations kept of one policy; where they are pictures, there are fewer episodes, of two at least."""
 
 
 class EnvironmentRaised(RuntimeError):
@@ -122,6 +122,7 @@ def play(
     past_limit: int = 0,
     most_steps: int = 1000,
     most_in_all: int = 400_000,
+    share: float = 1.0,
 ) -> list[Episode]:
     """Play episodes side by side; the first of each environment and no other, so that short ones are not favoured.
 
@@ -134,6 +135,7 @@ def play(
         past_limit: steps that are played past the environment's limit where it can be lifted.
         most_steps: of an episode where the environment has no limit.
         most_in_all: steps of all episodes together.
+        share: of the memory that the observations of one policy may take.
 
     Raises:
         EnvironmentRaised: its code raised an error.
@@ -144,7 +146,8 @@ def play(
         int(np.prod(world.observation_space.shape or (1,)))
         * (world.observation_space.dtype or np.dtype(float)).itemsize
     )
-    most_in_all = min(most_in_all, max(2048, _MOST_BYTES // size))
+    most = limit + (past_limit if lift else 0)
+    num_episodes = min(num_episodes, max(int(share * _MOST_BYTES / size / most), 2))
     envs = [world.lifted() if lift else world.make() for _ in range(num_episodes)]
     rng, until = np.random.default_rng(seed), time.monotonic() + seconds
     try:
@@ -156,7 +159,6 @@ def play(
             for run, action, row in zip(going, actions.tolist(), values, strict=True):
                 run.step(action, row, world.first_action)
             steps += len(going)
-            most = limit + (past_limit if lift else 0)
             going = [run for run in going if not run.ended and len(run.actions) < most]
         return [run.episode(limit) for run in runs if run.actions]
     finally:

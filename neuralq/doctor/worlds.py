@@ -42,6 +42,7 @@ class World:
         limit: steps after which `TimeLimit` truncates; None without one.
         liftable: whether that limit can be lifted, so that episodes go on past it.
         model: the exact model; None where there is none.
+        seen_as: the observation of each state of the model, ``[S, *obs]``; None without one.
         named: how `neuralq train` is told of it, in words of a command line.
     """
 
@@ -53,6 +54,7 @@ class World:
     limit: int | None
     liftable: bool
     model: FiniteMDP | None
+    seen_as: Array | None
     named: tuple[str, ...]
 
     def lifted(self) -> gym.Env[Any, Any]:
@@ -121,9 +123,10 @@ def open_world(env: Any) -> World:
             )
         found, spec = _limit_of(first), first.spec
         limit = found._max_episode_steps if found is not None else None if spec is None else spec.max_episode_steps
+        model, seen_as = _model(env, first)
         return World(
             name=handed.env, make=make, num_actions=num_actions, first_action=first_action, observation_space=space,
-            limit=limit, liftable=found is not None, model=_model(env, first), named=_named(env, handed),
+            limit=limit, liftable=found is not None, model=model, seen_as=seen_as, named=_named(env, handed),
         )  # fmt: skip
     finally:
         first.close()
@@ -138,9 +141,20 @@ def _named(env: Any, handed: Handed) -> tuple[str, ...]:
     return (handed.env, *(word for n, v in changed.items() for word in (f"--{n.replace('_', '-')}", json.dumps(v))))
 
 
-def _model(env: Any, made: gym.Env[Any, Any]) -> FiniteMDP | None:
-    if isinstance(env, FiniteMDP):
-        return env
+def _model(env: Any, made: gym.Env[Any, Any]) -> tuple[FiniteMDP | None, Array | None]:
+    """The model, and what its states look like: their numbers, or what wrappers of observations make of them."""
+    wrappers: list[gym.ObservationWrapper[Any, Any, Any]] = []
+    inner: Any = made
+    while isinstance(inner, gym.Wrapper) and not isinstance(inner.observation_space, spaces.Discrete):
+        if isinstance(inner, gym.ObservationWrapper):
+            wrappers.insert(0, inner)
+        inner = inner.env
     with contextlib.suppress(Exception):  # there is none, or it is not this environment's
-        return FiniteMDP.from_gymnasium(made)
-    return None
+        model = env if isinstance(env, FiniteMDP) else FiniteMDP.from_gymnasium(inner)
+        if not isinstance(inner.observation_space, spaces.Discrete):
+            return model, None
+        seen = list(range(int(inner.observation_space.start), int(inner.observation_space.start) + model.num_states))
+        for wrapper in wrappers:
+            seen = [wrapper.observation(s) for s in seen]
+        return model, np.stack([np.asarray(s) for s in seen])
+    return None, None

@@ -14,7 +14,7 @@ from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
 
-__all__ = ["CannotMeasure", "Case", "begin", "stacked"]
+__all__ = ["CannotMeasure", "Case", "begin", "seen_at", "stacked"]
 
 NUM_GREEDY, NUM_EXPLORED, NUM_OTHER = 100, 30, 30
 _EPSILON = 0.1
@@ -82,13 +82,19 @@ class Case:
 
     def visited(self, num: int, number: int) -> Array:
         """Observations that its policy meets (greedy and explored), ``[≤ num, *obs]``."""
-        pool = [one.observations[:-1] for one in (*self.greedy, *self.explored)]
-        observations = np.concatenate(pool)
-        picked = self.rng(number).permutation(len(observations))[:num]
-        return observations[picked]
+        pool = [*self.greedy, *self.explored]
+        return seen_at(pool, self.rng(number).permutation(sum(one.length for one in pool))[:num])
 
 
 Measurement = Callable[[Case], "Finding | Sequence[Finding]"]
+
+
+def seen_at(episodes: Sequence[Episode], steps: Indices, later: int = 0) -> Array:
+    """The observations of these steps, which are numbered through all episodes, or of the ones after: ``[n, *obs]``."""
+    begins = np.cumsum([0, *(one.length for one in episodes)])
+    which = np.searchsorted(begins, steps, side="right") - 1
+    rows = [episodes[i].observations[t - begins[i] + later] for i, t in zip(which, steps, strict=True)]
+    return np.stack(rows)
 
 
 def stacked(episodes: Sequence[Episode]) -> tuple[Array, Indices, Floats, Array, Array, Indices]:
@@ -129,10 +135,11 @@ def begin(
     say("playing greedy episodes")
     best = play(world, greedy, NUM_GREEDY, seed, seconds=0.25 * budget, past_limit=past)
     say("playing with ε = 0.1, at random, and each action alone")
-    tried = play(world, explored, NUM_EXPLORED, seed + 1000, seconds=0.1 * budget, past_limit=past)
-    random = play(world, chance, NUM_OTHER, seed + 2000, seconds=0.1 * budget)
+    tried = play(world, explored, NUM_EXPLORED, seed + 1000, seconds=0.1 * budget, past_limit=past, share=0.5)
+    random = play(world, chance, NUM_OTHER, seed + 2000, seconds=0.1 * budget, share=0.5)
     each = max(3, 30 // num_actions)
     constant = {
-        a: play(world, always(a), each, seed + 3000, seconds=0.1 * budget / num_actions) for a in range(num_actions)
+        a: play(world, always(a), each, seed + 3000, seconds=0.1 * budget / num_actions, share=0.5 / num_actions)
+        for a in range(num_actions)
     }
     return Case(subject, world, gamma, settings, seed, clock, best, tried, random, constant, stored)

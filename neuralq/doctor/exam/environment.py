@@ -158,9 +158,9 @@ def observation_scale(case: Case) -> Finding:
     """E4: how differently large the entries of an observation are, and how large."""
     if case.world.is_discrete:
         raise CannotMeasure("observations are numbers of states, which have no scale")
-    rows = np.concatenate([one.observations[:-1] for one in (*case.greedy, *case.explored, *case.chance)])
-    if rows.dtype == np.uint8:
+    if case.world.observation_space.dtype == np.uint8:
         raise CannotMeasure("observations are pictures in bytes, whose scale is known")
+    rows = np.concatenate([one.observations[:-1] for one in (*case.greedy, *case.explored, *case.chance)])
     x = case.world.as_rows(rows)
     large = float(np.quantile(np.abs(x), 0.99))
     spread = x.std(0)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from gymnasium import spaces
 
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.findings import Finding
 from neuralq.exact import solve
 from neuralq.exact.evaluation import evaluate
 from neuralq.mdp import FiniteMDP
+from neuralq.types import Array, Indices
 
 __all__ = ["against_optimum", "regret"]
 
@@ -60,19 +60,17 @@ def against_optimum(case: Case) -> Finding:
 
 
 def _values(case: Case) -> tuple[FiniteMDP, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    model = case.world.model
+    model, seen = case.world.model, case.world.seen_as
     if model is None:
         raise CannotMeasure("the environment has no model that could be solved exactly")
-    if case.world.is_discrete:
-        space = case.world.observation_space
-        assert isinstance(space, spaces.Discrete)
-        if int(space.n) != model.num_states:
-            raise CannotMeasure("observations are not the states of the model")
-        return model, case.subject.values(np.arange(model.num_states) + int(space.start))
-    raise CannotMeasure("observations are not the numbers of the model's states")
-
-
-def _states(case: Case, observations: object) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
     space = case.world.observation_space
-    assert isinstance(space, spaces.Discrete)
-    return np.asarray(observations, np.int64).reshape(-1) - int(space.start)
+    if seen is None or (case.world.is_discrete and int(space.n) != model.num_states):  # type: ignore[attr-defined]
+        raise CannotMeasure("what the states of the model look like is not known")
+    return model, case.subject.values(seen)
+
+
+def _states(case: Case, observations: Array) -> Indices:
+    """The states that look so; of several that look alike all."""
+    assert case.world.seen_as is not None
+    met = {np.asarray(s).tobytes() for s in observations.astype(case.world.seen_as.dtype)}
+    return np.flatnonzero([s.tobytes() in met for s in case.world.seen_as])

@@ -24,7 +24,7 @@ from neuralq.doctor.findings import Finding
 from neuralq.doctor.play import Episode, returns_from
 from neuralq.types import Floats
 
-__all__ = ["hypotheses", "one_step"]
+__all__ = ["hypotheses", "lines", "one_step"]
 
 _GAMMAS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
 _BETTER, _ALIKE = 0.8, 0.05
@@ -77,6 +77,25 @@ def hypotheses(case: Case) -> Finding:
         (low / scale + 1, high / scale + 1), _BETTER, "our own", clear and far and alike is None, said, best.remedy,
         best.confirm,
     )  # fmt: skip
+
+
+def lines(case: Case, most: int = 2) -> dict[str, Floats]:
+    """What values would be, by the return that followed, under the mistakes that fit them best: ``[≤ 20, 2]`` each.
+
+    Means over twenty equal parts of the steps, in the order of their returns.
+
+    Raises:
+        CannotMeasure: returns are not known.
+    """
+    made, errors, _ = _errors(case)
+    found = {}
+    for one in sorted(made, key=lambda one: float(errors[one.name].sum()))[:most]:
+        right = [returns_from(episode, case.gamma, 0.01 if case.world.liftable else 0.05) for episode in case.greedy]
+        wrong = [one.returns(episode)[: len(g)] for episode, g in zip(case.greedy, right, strict=True)]
+        points = np.column_stack([np.concatenate(right), np.concatenate(wrong)])
+        parts = np.array_split(points[np.argsort(points[:, 0], kind="stable")], 20)
+        found[one.name] = np.array([part.mean(0) for part in parts if len(part)])
+    return found
 
 
 def _told_apart(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuralq.doctor.exam.case import CannotMeasure, Case, stacked
+from neuralq.doctor.exam.case import CannotMeasure, Case, seen_at
 from neuralq.doctor.findings import Finding
 from neuralq.lab.networks.sampled import diagnose_sample
 from neuralq.lab.watch.advice import RunTraits, advise
@@ -182,14 +182,16 @@ class _Values(nn.Module):
 
 def _transitions(case: Case, num: int, number: int) -> Transition:
     assert case.subject.encode is not None
-    s, a, r, s_t, ended, _ = stacked((*case.greedy, *case.explored))
+    pool = [*case.greedy, *case.explored]
+    a, r = (np.concatenate([getattr(one, name) for one in pool]) for name in ("actions", "rewards"))
+    ended = np.concatenate([np.arange(one.length) == (one.length - 1 if one.terminated else -1) for one in pool])
     pick = case.rng(number).permutation(len(r))[:num]
     scale = case.settings.reward_scale or 1.0
     discount = np.where(ended[pick], 0.0, case.gamma)
-    count = len(pick)
+    now, ahead = (case.subject.encode(seen_at(pool, pick, later)) for later in (0, 1))
     return Transition(
-        case.subject.encode(s[pick]), torch.as_tensor(a[pick]), torch.ones(count),
-        torch.as_tensor(scale * r[pick]).float(), torch.as_tensor(discount).float(), case.subject.encode(s_t[pick]),
+        now, torch.as_tensor(a[pick]), torch.ones(len(pick)),
+        torch.as_tensor(scale * r[pick]).float(), torch.as_tensor(discount).float(), ahead,
         torch.as_tensor(ended[pick]),
     )  # fmt: skip
 
@@ -200,7 +202,7 @@ def kernel(case: Case) -> Finding:
     weights = sum(p.numel() for p in network.parameters())
     if weights > _MOST_WEIGHTS:
         raise CannotMeasure(f"the network has {weights:,} weights; the kernel is computed for up to {_MOST_WEIGHTS:,}")
-    num = int(min(64, max(8, 4e7 // weights)))
+    num = int(min(64, max(8, 2e7 // weights)))
     rate = case.settings.learning_rate or 1e-4
     found = diagnose_sample(
         cast(Any, _Values(case, copy.deepcopy(network), case.world.num_actions)), _transitions(case, num, 25), rate
