@@ -28,6 +28,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scr
     """The lines that the script prints."""
     monkeypatch.setattr(sys, "argv", [script, *arguments])
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT / "scripts")])  # as Python has it; one script imports another
     runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
     return capsys.readouterr().out.splitlines()
 
