@@ -56,6 +56,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 def pytest_sessionfinish() -> None:
     """Writes what was seen."""
     _lines[0].stop()
+    if not _seconds:
+        return  # the process that hands tests to others runs none, and coverage warns of that
     data = _lines[0].get_data()
     lines: dict[str, dict[str, list[int]]] = defaultdict(dict)
     for file in data.measured_files():
