@@ -28,7 +28,8 @@ SOURCES := $(sort $(wildcard *.md) Makefile pyproject.toml constraints.txt \
 LISTED := $(STAMPS)/sources
 
 # One BLAS thread: the arrays of the tests are small, and the test processes share the cores. A file stays in one process
-# (--dist loadfile), so that the kernels of a file are not compiled in each of them.
+# (--dist loadfile), so that the kernels of a file are not compiled in each of them; tests/conftest.py orders the files.
+SIDE_BY_SIDE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .PHONY: help demo test check slow mutants wheel clean always
@@ -43,7 +44,7 @@ test: $(TEST_INSTALLED) $(LISTED)  ## installs what tests need, then runs the fa
 	@$(run_fast_tests)
 
 slow: $(TEST_INSTALLED)  ## runs the slow tests
-	@$(PYTEST) -n $(WORKERS) --dist loadfile -m slow
+	@$(PYTEST) $(SIDE_BY_SIDE) -m slow
 
 check: $(DEV_INSTALLED)  ## format, lint, types, floors, and the fast tests unless they passed on these very sources
 	$(BIN)/ruff format --check
@@ -66,7 +67,7 @@ clean:  ## removes .venv, caches and builds; keeps runs/
 # The stamp is as old as the start of the run, so that a file edited meanwhile counts as untested.
 define run_fast_tests
 rm -f $(FAST_PASSED); touch $(FAST_PASSED).started; \
-$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow"; \
+$(PYTEST) $(SIDE_BY_SIDE) -m "not slow"; \
 mv $(FAST_PASSED).started $(FAST_PASSED)
 endef
 

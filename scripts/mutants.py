@@ -228,7 +228,7 @@ def control(parent: str, kept: Path | None, workers: int) -> tuple[Seen, str]:
     seen = {test: ran for test, ran in seen.items() if test.split("::")[0] in stand}
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(copy), str(copy / "envs"))), "OMP_NUM_THREADS": "1"}
     options = ["-q", "-p", "no:cacheprovider", "-m", "not slow"]
-    side_by_side = ["-n", str(workers), "--dist", "loadfile"] if workers > 1 else []
+    side_by_side = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"] if workers > 1 else []
     command = [sys.executable, "scripts/who_runs_what.py", folder, *options, *side_by_side, *again]
     if again:
         result = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
