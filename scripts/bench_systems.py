@@ -41,6 +41,14 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def elevators(num_hours: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.elevators.training import Settings, train
+
+    train(np.random.SeedSequence(0), Settings(num_hours))
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
@@ -49,6 +57,7 @@ def pole_q_lambda(num_trials: int) -> None:
 
 WORK = {
     "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
+    "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }
 
