@@ -1,7 +1,6 @@
-"""Backed-up scores, alpha-beta and rote learning, and what checkers must reach with them.
+"""Checkers that learns from backed-up scores and by rote, and what it must reach.
 
-Mutants that die here: a target not cut, or cut at another number, a decided score that teaches, the fixed weight moved,
-the error with the other sign, terms of the position now instead of the one before, of the other side's, a step size
+Mutants that die here: terms of the position now instead of the one before, of the other side's, a step size
 that does not fall; alpha and beta exchanged or not turned round, a search that ends amid captures; a term of a row
 beside it or of the other side's view; a win that is worth more when it is further away, or counted from the root where
 it is remembered; a score taken from a shallower search, or for a position that only hashes alike.
@@ -15,7 +14,6 @@ from typing import Any
 import checkers_slowly
 import numpy as np
 import pytest
-import torch
 from test_checkers import kings_at_random
 
 from neuralq.systems import run_system, system_named
@@ -25,81 +23,16 @@ from neuralq.systems.checkers.oracle import difference_from_alpha_beta, differen
 from neuralq.systems.checkers.player import LEARNED, CheckersPlayer
 from neuralq.systems.checkers.search import new_desk, search, shifted_score
 from neuralq.systems.checkers.system import learned
-from neuralq.systems.checkers.terms import MATERIAL_ONLY, NUM_TERMS, TERMS, evaluate, write_terms
+from neuralq.systems.checkers.terms import MATERIAL_ONLY, NUM_TERMS, TERMS, write_terms
+from neuralq.systems.checkers.terms import evaluate as weighed
 from neuralq.systems.checkers.training import carry_out, new_program, pieces_at_random, play_match, study, train
-from neuralq.tabular import BackupRule, alpha_beta, backup_update, new_stream
+from neuralq.tabular import new_stream
 from neuralq.tabular.kernels.random_numbers import uniform
 from neuralq_envs.checkers import Position
-
-# ---- the rules of the library
-
-
-def test_a_backed_up_score_corrects_by_the_gradient_and_the_first_weights_stay() -> None:
-    rng = np.random.default_rng(0)
-    for num_fixed, backed_up in itertools.product((0, 1, 3), (-49.0, -12.5, -3.0, 0.2, 11.0, 12.5, 49.9)):
-        weights, terms = rng.normal(size=(2, 5))
-        w = torch.tensor(weights, requires_grad=True)
-        loss = (min(max(backed_up, -12.0), 12.0) - w @ torch.tensor(terms)) ** 2 / 2
-        loss.backward()  # type: ignore[no-untyped-call]
-        assert w.grad is not None
-        expected = np.where(np.arange(5) < num_fixed, weights, weights - 0.03 * w.grad.numpy())
-        error = backup_update(weights, BackupRule(num_fixed), terms, backed_up, 0.03)
-        assert np.allclose(weights, expected, rtol=0, atol=1e-15) and abs(error) == pytest.approx(
-            np.sqrt(2 * loss.item())
-        )
-    before = weights.copy()
-    assert backup_update(weights, BackupRule(decided=20.0), terms, -20.5, 0.03) == 0.0 and (weights == before).all()
-    assert backup_update(weights, BackupRule(decided=20.0), terms, -19.5, 0.03) != 0.0
-
-
-def minimax(node: Any, depth: int) -> float:
-    """A tree is a leaf's value with its children; an odd tenth of the value says that it is not quiet."""
-    value, children = node
-    if not children or (depth <= 0 and int(value * 10) % 2 == 0):
-        return float(value)
-    return max(-minimax(child, depth - 1) for child in children)
-
-
-def test_alpha_beta_is_minimax_and_looks_at_less() -> None:
-    rng = np.random.default_rng(0)
-
-    def grown(height: int) -> Any:
-        value = round(float(rng.normal()), 1)
-        return value, [grown(height - 1) for _ in range(rng.integers(0, 5))] if height else []
-
-    looked = [0, 0]
-    for _ in range(150):
-        tree, depth = grown(6), int(rng.integers(0, 6))
-
-        def evaluate_and_count(node: Any) -> float:
-            looked[0] += 1
-            return float(node[0])
-
-        found = alpha_beta(
-            tree, depth, lambda node: node[1], evaluate_and_count, lambda node: int(node[0] * 10) % 2 == 0
-        )
-        assert found.score == minimax(tree, depth)
-        end = found.line[-1] if found.line else tree
-        assert end[0] * (-1) ** len(found.line) == found.score
-        window = alpha_beta(tree, depth, lambda node: node[1], lambda node: node[0],
-                            lambda node: int(node[0] * 10) % 2 == 0, -0.3, 0.4).score  # fmt: skip
-        assert np.clip(window, -0.3, 0.4) == np.clip(found.score, -0.3, 0.4)
-        stack = [(tree, depth)]
-        while stack:
-            (value, children), left = stack.pop()
-            if not children or (left <= 0 and int(value * 10) % 2 == 0):
-                looked[1] += 1
-            else:
-                stack += [(child, left - 1) for child in children]
-    assert looked[0] < 0.6 * looked[1]
-    with pytest.raises(ValueError, match="depth must be a whole number of at least 0"):
-        alpha_beta(0, -1, lambda node: [], float)
-
 
 # ---- checkers
 
 
-@pytest.mark.slow
 def test_terms_are_those_counted_on_coordinates_and_turn_with_the_board() -> None:
     rng, terms = np.random.default_rng(3), np.zeros(NUM_TERMS)
     seen = np.zeros(NUM_TERMS)
@@ -114,12 +47,11 @@ def test_terms_are_those_counted_on_coordinates_and_turn_with_the_board() -> Non
         write_terms(other.own, other.other, other.kings, terms)
         assert np.allclose(terms, -turned, rtol=0, atol=1e-12)
         weights = rng.normal(size=NUM_TERMS)
-        value = evaluate(other.own, other.other, other.kings, weights, np.zeros(NUM_TERMS))
+        value = weighed(other.own, other.other, other.kings, weights, np.zeros(NUM_TERMS))
         assert value == pytest.approx(-weights @ turned)
     assert (seen > 0).all()
 
 
-@pytest.mark.slow
 def test_the_search_is_alpha_beta_over_positions_and_a_memory_falsifies_nothing() -> None:
     for depth, plies in ((1, 12), (2, 45), (4, 30)):
         assert difference_from_alpha_beta(8, plies, depth) < 1e-12
@@ -136,7 +68,6 @@ def test_the_search_is_alpha_beta_over_positions_and_a_memory_falsifies_nothing(
     assert [shifted_score(x, 3, 0.01) for x in (99.0, -99.0, 12.0)] == [98.97, -98.97, 12.0]
 
 
-@pytest.mark.slow
 def test_a_win_says_how_far_away_it_is_and_so_does_a_remembered_one() -> None:
     near = Position.from_fen("B:W13:B6,K24")  # 6-9 13x6 would lose a man; other moves trap 13
     desk, stream, none = new_desk(), new_stream(0), new_memory(0)
@@ -173,7 +104,6 @@ def _is_lost(board: checkers_slowly.Board, plies: int) -> bool:
     return plies > 0 and all(checkmate(after, plies - 1) is not None for after in ways)
 
 
-@pytest.mark.slow
 def test_the_compiled_games_are_those_of_a_loop_over_positions() -> None:
     num_games, epsilon = 3, 0.1
     ours = train(5, num_games, depth=2, step_sizes=(0.01, 0.0025), epsilon=epsilon)
@@ -207,7 +137,6 @@ def test_the_compiled_games_are_those_of_a_loop_over_positions() -> None:
     assert np.abs(ours[-1] - MATERIAL_ONLY).max() > 0.01 and ours[-1][0] == 1.0
 
 
-@pytest.mark.slow
 def test_a_player_ranks_moves_by_exact_scores_and_refuses_what_makes_no_sense() -> None:
     player = CheckersPlayer(depth=4, seed=0)
     for position in positions_of_games(10, 15, seed=4):
@@ -241,7 +170,6 @@ def test_learned_weights_beat_the_count_of_pieces_and_weights_at_random_do_not()
         assert play_match(new_program(weights), new_program(), seed).score < 0.5  # the control that must fail
 
 
-@pytest.mark.slow
 def test_the_ply_penalty_takes_the_nearer_win_and_keeps_its_word() -> None:
     found = carry_out(11)
     mean = {penalty: one.plies.mean() for penalty, one in found.endgames.items()}

@@ -92,52 +92,24 @@ def _untrained(drawn: bool) -> Callable[[np.random.SeedSequence, bool], Match]:
 
 def _page(found: Mapping[str, tuple[Outcome, ...]], full: bool) -> ChapterPage:
     trainings = cast("tuple[Learned, ...]", found[LEARNED])
+    nearer = cast("tuple[Wins, ...]", found[NEARER])
     studies = {name: cast("tuple[tuple[Endgames, ...], ...]", found[name]) for name in (ROTE, WANDERING)}
     deeper = cast("tuple[tuple[Endgames, ...], ...]", found[DEEPER])
-    nearer = cast("tuple[Wins, ...]", found[NEARER])
-    depth = 5 if full else 3
-    score = f"score against pieces alone, {depth} plies"
-    measured = {
-        LEARNED: Measured(f"{LEARNED}: {score}", tuple(one.match.score for one in trainings)),
-        "losses": Measured(f"{LEARNED}: games lost (%)", tuple(_lost(one.match) for one in trainings)),
-        "deeper": Measured(f"{LEARNED}: the same, {depth + 2} plies", tuple(one.deeper.score for one in trainings)),
-        "last": Measured(f"{LEARNED}: the same by the last weights", tuple(one.last.score for one in trainings)),
-        **{
-            name: Measured(f"{name}: {score}", tuple(one.score for one in cast("tuple[Match, ...]", found[name])))
-            for name in (MATERIAL, RANDOM)
-        },
-        **{
-            name: Measured(f"{name}: endgames won (%)", tuple(100 * tests[-1].won for tests in studies[name]))
-            for name in studies
-        },
-        "nodes": Measured(f"{ROTE}: positions looked at per endgame", tuple(_nodes(one[-1]) for one in studies[ROTE])),
-        **{
-            f"{plies} plies": Measured(f"{DEEPER}, {plies} plies: endgames won (%)", _won_of(deeper, i))
-            for i, plies in enumerate(_DEPTHS)
-        },
-        "nodes alone": Measured(
-            f"{DEEPER}, 3 plies: positions looked at per endgame", tuple(_nodes(one[0]) for one in deeper)
-        ),
-        **{
-            f"penalty {penalty:g}": Measured(
-                f"{NEARER} {penalty:g}: plies until a win that is seen is won",
-                tuple(float(one.endgames[penalty].plies.mean()) for one in nearer),
-            )
-            for penalty in nearer[0].endgames
-        },
-    }  # fmt: skip
+    untrained = {name: cast("tuple[Match, ...]", found[name]) for name in (MATERIAL, RANDOM)}
+    measured = {**_of_matches(trainings, untrained, 5 if full else 3), **_of_endgames(studies, deeper, nearer)}
+    drawings = (
+        board_picture(trainings[0].weights),
+        weights_picture([one.history for one in trainings]),
+        rote_picture(studies, deeper, _ROUND, _DEPTHS),
+        announced_picture(nearer),
+    )
     return ChapterPage(
         "checkers",
         "Checkers, learned from backed-up scores and by rote",
         "13.8",
         _text(measured),
         (*_published(measured), *_ours(measured, trainings)),
-        (
-            board_picture(trainings[0].weights),
-            weights_picture([one.history for one in trainings]),
-            rote_picture(studies, deeper, _ROUND, _DEPTHS),
-            announced_picture(nearer),
-        ),
+        drawings,
         source="Samuel 1959",
         measured=tuple(measured.values()),
         facts={
@@ -149,6 +121,49 @@ def _page(found: Mapping[str, tuple[Outcome, ...]], full: bool) -> ChapterPage:
             "draws": "60 plies without a capture or a move of a man, 40 in training",
         },
     )
+
+
+def _of_matches(
+    trainings: tuple[Learned, ...], untrained: Mapping[str, tuple[Match, ...]], depth: int
+) -> dict[str, Measured]:
+    score = f"score against pieces alone, {depth} plies"
+    return {
+        LEARNED: Measured(f"{LEARNED}: {score}", tuple(one.match.score for one in trainings)),
+        "losses": Measured(f"{LEARNED}: games lost (%)", tuple(_lost(one.match) for one in trainings)),
+        "deeper": Measured(f"{LEARNED}: the same, {depth + 2} plies", tuple(one.deeper.score for one in trainings)),
+        "last": Measured(f"{LEARNED}: the same by the last weights", tuple(one.last.score for one in trainings)),
+        **{
+            name: Measured(f"{name}: {score}", tuple(one.score for one in matches))
+            for name, matches in untrained.items()
+        },
+    }
+
+
+def _of_endgames(
+    studies: Mapping[str, tuple[tuple[Endgames, ...], ...]],
+    deeper: tuple[tuple[Endgames, ...], ...],
+    nearer: tuple[Wins, ...],
+) -> dict[str, Measured]:
+    looked_at = "positions looked at per endgame"
+    return {
+        **{
+            name: Measured(f"{name}: endgames won (%)", tuple(100 * tests[-1].won for tests in trainings))
+            for name, trainings in studies.items()
+        },
+        **{
+            f"{plies} plies": Measured(f"{DEEPER}, {plies} plies: endgames won (%)", _won_of(deeper, i))
+            for i, plies in enumerate(_DEPTHS)
+        },
+        "nodes": Measured(f"{ROTE}: {looked_at}", tuple(_nodes(one[-1]) for one in studies[ROTE])),
+        "nodes alone": Measured(f"{DEEPER}, 3 plies: {looked_at}", tuple(_nodes(one[0]) for one in deeper)),
+        **{
+            f"penalty {penalty:g}": Measured(
+                f"{NEARER} {penalty:g}: plies until a win that is seen is won",
+                tuple(float(one.endgames[penalty].plies.mean()) for one in nearer),
+            )
+            for penalty in nearer[0].endgames
+        },
+    }
 
 
 def _lost(match: Match) -> float:
