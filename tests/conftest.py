@@ -66,7 +66,7 @@ def unpainted(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 # Two processes that begin with these share no kernel; whoever comes to the networks' later finds them compiled.
-FIRST = ("test_engine", "test_backgammon_match", "test_contract_lab_methods")
+FIRST = ("test_engine", "test_contract_lab_methods")
 
 
 def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
@@ -75,8 +75,17 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
     return (FIRST.index(stem) if stem in FIRST else len(FIRST), -sizes[item.path], str(item.path))
 
 
+# Loops of whole systems take long to compile: their tests are run by `make systems`, which CI does too.
+SYSTEMS = ("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
+    """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
+    for item in items:
+        of_system = item.path.stem in SYSTEMS or ROOT / "neuralq" / "systems" in item.path.parents
+        if of_system and item.get_closest_marker("slow") is None:
+            item.add_marker("slow")
+            item.add_marker("systems")
     sizes = Counter(item.path for item in items)
     items.sort(key=lambda item: place(item, sizes))  # stable: the order within a file stays
     if not torch.cuda.is_available():
