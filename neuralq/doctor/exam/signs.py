@@ -15,7 +15,7 @@ from neuralq.doctor.exam.case import CannotMeasure
 from neuralq.q.bodies import ACTIVATIONS, GroupedConv, GroupedLinear, Trunk
 from neuralq.types import Transition
 
-__all__ = ["NUM_FRESH", "Outputs", "dormant_share", "fan_in_of", "fresh", "hidden", "lag_of", "moved", "rank_of"]
+__all__ = ["NUM_FRESH", "dormant_share", "fan_in_of", "fresh", "hidden", "lag_of", "moved", "rank_of"]
 
 NUM_FRESH = 8
 """Fresh networks that a trained one is set beside."""
@@ -154,7 +154,7 @@ def moved(network: nn.Module, outputs: Outputs, step: Transition, rate: float, x
     with torch.no_grad():
         for p, g in zip(weights, torch.autograd.grad(loss, weights, allow_unused=True), strict=True):
             if g is not None:  # Adam's first step, written out: to make torch.optim.Adam takes a second
-                p -= rate * g / (g.abs() + 1e-8)
+                p.sub_(rate * g / (g.abs() + 1e-8))
         after = outputs(learns, x)
     change = (before - after)[torch.isfinite(before)]  # illegal actions have no value
     return float((before.argmax(1) != after.argmax(1)).float().mean()), float(change.abs().mean())
