@@ -58,7 +58,7 @@ def discounted_powers(seconds: float, beta: float) -> Any:
 
     Example:
         >>> [round(float(value), 9) for value in discounted_powers(2.0, 0.5)]
-        [1.264241118, 1.056964471, 1.284862872, 0.367879441]
+        [1.264241118, 1.056964471, 1.284822353, 0.367879441]
     """
     x = beta * seconds
     e = math.exp(-x)
