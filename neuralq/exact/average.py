@@ -213,7 +213,7 @@ def _policy_iteration(
     stopped = beaten.size > 0
     gap = float(np.max(best_drift[states] - found.gain[states], initial=0.0))
     excess = float(np.max(worth[challenger[states]] - found.bias[states], initial=0.0))
-    bound = np.inf if stopped else max(gap, excess, 0.0) + float(np.finfo(np.float64).eps) * size
+    bound = np.inf if stopped else max(gap, excess) + float(np.finfo(np.float64).eps) * size
     return rows, found.bias, found.gain, iterations, bound
 
 
