@@ -28,10 +28,11 @@ SOURCES := $(sort $(wildcard *.md) Makefile pyproject.toml constraints.txt \
 LISTED := $(STAMPS)/sources
 
 # One BLAS thread: the arrays of the tests are small, and the test processes share the cores. A file stays in one process
-# (--dist loadfile), so that the kernels of a file are not compiled in each of them.
+# (--dist loadfile), so that the kernels of a file are not compiled in each of them; tests/conftest.py orders the files.
+SIDE_BY_SIDE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test check slow mutants wheel clean always
+.PHONY: help demo test systems check slow mutants wheel clean always
 
 help:  ## lists the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
@@ -42,8 +43,11 @@ demo: $(DEMO_INSTALLED)  ## installs, then trains on CartPole, shows Baird's sta
 test: $(TEST_INSTALLED) $(LISTED)  ## installs what tests need, then runs the fast tests
 	@$(run_fast_tests)
 
-slow: $(TEST_INSTALLED)  ## runs the slow tests
-	@$(PYTEST) -n $(WORKERS) --dist loadfile -m slow
+systems: $(TEST_INSTALLED)  ## runs the tests of whole systems, whose loops take a minute to compile
+	@$(PYTEST) $(SIDE_BY_SIDE) -m systems
+
+slow: $(TEST_INSTALLED)  ## runs the slow tests, those of systems too
+	@$(PYTEST) $(SIDE_BY_SIDE) -m slow
 
 check: $(DEV_INSTALLED)  ## format, lint, types, floors, and the fast tests unless they passed on these very sources
 	$(BIN)/ruff format --check
@@ -63,10 +67,12 @@ clean:  ## removes .venv, caches and builds; keeps runs/
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamp is as old as the start of the run, so that a file edited meanwhile counts as untested.
+# The stamp is as old as the start of the run, so that a file edited meanwhile counts as untested. What asserts compare is
+# written into each test by pytest, which costs each process seconds: only tests that failed are run once more with it.
 define run_fast_tests
 rm -f $(FAST_PASSED); touch $(FAST_PASSED).started; \
-$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow"; \
+$(PYTEST) $(SIDE_BY_SIDE) --assert=plain -m "not slow" || { \
+  echo "Those that failed once more, with what they compared:"; $(PYTEST) --last-failed --last-failed-no-failures none -m "not slow"; exit 1; }; \
 mv $(FAST_PASSED).started $(FAST_PASSED)
 endef
 

@@ -7,10 +7,11 @@
 Mutants are made by cosmic-ray, in copies of the checkout; yours is not touched. First the fast tests have to pass on a
 copy that nobody has broken, and each is asked which lines it runs; ``--seen FILE`` keeps that, so that the next time
 only tests run again that changed, or whose lines did. Then mutants are drawn at random from a seed that is printed, in
-turn from each room, until the time is up. Each meets the tests that run its line, quick files first, up to the first
-failure; a line that is only run by imports or compiled kernels meets the tests of its file and of those that import it.
-A test that also fails alone on sound code kills nothing. A survivor that computes the same is struck, with the reason,
-in ``scripts/equivalent_mutants.toml``. Exit status 1 when a room kills under 95 % of the others.
+turn from each room, until the time is up; the tests on sound code count towards it. Each mutant meets the tests that
+run its line, quick files first, up to the first failure; a line that is only run by imports or compiled kernels meets
+the tests of its file and of those that import it. A test that also fails alone on sound code kills nothing. A survivor
+that computes the same is struck, with the reason, in ``scripts/equivalent_mutants.toml``. Exit status 1 when a room
+kills under 95 % of the others.
 """
 
 from __future__ import annotations
@@ -227,7 +228,7 @@ def control(parent: str, kept: Path | None, workers: int) -> tuple[Seen, str]:
     seen = {test: ran for test, ran in seen.items() if test.split("::")[0] in stand}
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(copy), str(copy / "envs"))), "OMP_NUM_THREADS": "1"}
     options = ["-q", "-p", "no:cacheprovider", "-m", "not slow"]
-    side_by_side = ["-n", str(workers), "--dist", "loadfile"] if workers > 1 else []
+    side_by_side = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"] if workers > 1 else []
     command = [sys.executable, "scripts/who_runs_what.py", folder, *options, *side_by_side, *again]
     if again:
         result = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
@@ -366,18 +367,18 @@ def drawn(rooms: dict[str, list[Path]], seed: int) -> Iterator[Mutant]:
 
 
 def run(
-    parent: str, seen: Seen, mutants: Iterator[Mutant], minutes: float, workers: int
+    parent: str, seen: Seen, mutants: Iterator[Mutant], deadline: float, workers: int
 ) -> list[tuple[Mutant, str, str]]:
-    """What became of each mutant that began before the time was up."""
+    """What became of each mutant that began before the deadline."""
     from who_runs_what import tests_of  # a script beside this one
 
     begun = time.monotonic()
     results: list[tuple[Mutant, str, str]] = []
     pending: dict[Future[tuple[str, str]], Mutant] = {}
     with ProcessPoolExecutor(workers, initializer=enter_copy, initargs=(parent,)) as pool, Progress() as progress:
-        bar = progress.add_task("mutants", total=60 * minutes)
+        bar = progress.add_task("mutants", total=max(deadline - begun, 0))
         while True:
-            while len(pending) < workers and time.monotonic() < begun + 60 * minutes:
+            while len(pending) < workers and time.monotonic() < deadline:
                 mutant = next(mutants, None)
                 if mutant is None:
                     break
@@ -402,10 +403,11 @@ def main() -> int:
     parser.add_argument("--room", action="append", choices=ROOMS, help="only this room (may be given again)")
     parser.add_argument("--file", action="append", type=Path, help="only this file of the library (may be given again)")
     parser.add_argument("--seed", type=int, help="draws the mutants (default: a new one)")
-    parser.add_argument("--minutes", type=float, default=25.0, help="no mutant begins later (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=26.0, help="no mutant begins later (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="mutants tried side by side (default: %(default)s)")
     parser.add_argument("--seen", type=Path, metavar="FILE", help="keeps which lines each test runs, for the next time")
     arguments = parser.parse_args()
+    deadline = time.monotonic() + 60 * arguments.minutes
 
     if missing := [str(file) for file in arguments.file or () if not file.is_file()]:
         parser.error(f"no such file: {', '.join(missing)}")
@@ -422,7 +424,7 @@ def main() -> int:
         if said:
             print(f"{said}\nThe tests fail on the code as it is; mend that first.")
             return 2
-        results = run(parent, seen, drawn(rooms, seed), arguments.minutes, arguments.workers)
+        results = run(parent, seen, drawn(rooms, seed), deadline, arguments.workers)
 
     short = False
     for room in rooms:

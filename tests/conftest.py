@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from collections import Counter
 from collections.abc import Iterator
 from html import escape
 from importlib.util import find_spec
@@ -64,8 +65,29 @@ def unpainted(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+# Two processes that begin with these share no kernel; whoever comes to the networks' later finds them compiled.
+FIRST = ("test_engine", "test_contract_lab_methods")
+
+
+def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
+    """Files in the order in which processes take them: those that compile much, then the large ones."""
+    stem = item.path.stem
+    return (FIRST.index(stem) if stem in FIRST else len(FIRST), -sizes[item.path], str(item.path))
+
+
+# Loops of whole systems take long to compile: their tests are run by `make systems`, which CI does too.
+SYSTEMS = ("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests marked ``gpu`` are skipped where torch finds no accelerator."""
+    """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
+    for item in items:
+        of_system = item.path.stem in SYSTEMS or ROOT / "neuralq" / "systems" in item.path.parents
+        if of_system and item.get_closest_marker("slow") is None:
+            item.add_marker("slow")
+            item.add_marker("systems")
+    sizes = Counter(item.path for item in items)
+    items.sort(key=lambda item: place(item, sizes))  # stable: the order within a file stays
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu") is not None:

@@ -295,14 +295,17 @@ def in_a_fresh_process(program: str) -> str:
         "import neuralq_envs, gymnasium; neuralq_envs.register(); gymnasium.make('neuralq/MitchellGrid-v0').reset()",
         "import gymnasium, neuralq_envs; gymnasium.make_vec('neuralq/MitchellGrid-v0', num_envs=2).reset(seed=0)",
         # Two forks of one process, which has loaded what is large and nothing of ours.
-        "import os, torch, gymnasium; first = os.fork()\n"
-        "assert not {name for name in sys.modules if name.startswith('neuralq')}\n"
-        "if first:\n"
-        "  import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0\n"
-        "  assert os.waitpid(first, 0)[1] == 0\n"
-        "else:\n"
-        "  from neuralq.runs.recipe.environments import make_envs; import neuralq\n"
-        "  make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()\n",
+        pytest.param(
+            "import os, torch, gymnasium; first = os.fork()\n"
+            "assert not {name for name in sys.modules if name.startswith('neuralq')}\n"
+            "if first:\n"
+            "  import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0\n"
+            "  assert os.waitpid(first, 0)[1] == 0\n"
+            "else:\n"
+            "  from neuralq.runs.recipe.environments import make_envs; import neuralq\n"
+            "  make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()\n",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_environments_are_found_by_an_import_and_by_what_neuralq_does(program: str) -> None:

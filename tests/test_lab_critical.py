@@ -176,6 +176,9 @@ def test_dips_that_are_alike_at_all_points_are_looked_into_and_what_only_touches
     found = crossings(lambda x: 0.9 + float(np.cos(2 * np.pi * x)), np.arange(4.0))
     assert len(found) >= 2 and np.cos(2 * np.pi * np.array(found)) == pytest.approx(-0.9)
     assert crossings(lambda x: max(abs(x - 0.45) - 0.01, 0.0), np.linspace(0, 1, 6)) == ()
+    # at a point where the margin is 0 it is not stable: two ends of what is stable meet there, or none
+    assert crossings(lambda x: abs(x - 2), np.arange(1.0, 4.0)) == pytest.approx((2.0, 2.0))
+    assert crossings(lambda x: -abs(x - 2), np.arange(1.0, 4.0)) == ()
     # ends of the range are no dips, and the margin of one that falls to its end is not looked at beyond it
     assert crossings(lambda x: 1.01 - x, np.linspace(0, 1, 11)) == ()
     assert crossings(lambda x: x - 0.5, np.array([0.0, 1.0])) == pytest.approx((0.5,))

@@ -159,6 +159,24 @@ def test_a_run_in_one_piece(
     assert found.oscillates == (m < 0)
 
 
+def test_a_piece_is_as_near_to_a_singular_one_as_its_slowest_direction_to_its_fastest() -> None:
+    M = np.diag([0.5, 0.9])  # I − M = diag(.5, .1)
+    found = diagnose(garnet(0, num_weights=2), own(lambda theta, step_size: (M, np.ones(2)), size=2))
+    assert found.distance_to_singularity == pytest.approx(0.2)
+
+
+def test_where_the_mean_settles_at_every_step_size_the_variance_is_looked_for_around_the_own_one() -> None:
+    """An update whose mean is given implicitly, M = 1/(1 + α), and whose samples are TD's, 1 − α/10."""
+
+    def implicit(process: object, options: object) -> Expected:
+        return Expected(1, lambda theta, a: (np.eye(1) / (1 + a), theta * 0), linear=True)
+
+    one = dataclasses.replace(TD, expected=implicit)
+    for alpha, bound in ((1e-3, 20.0), (2.0, 20.0), (1e-5, math.inf)):  # up to 1e5 times the step size
+        found = diagnose(one_weight(reward=0.0, step_size=alpha), one, sampling="iid")
+        assert found.step_size_bound_second_moment == pytest.approx(bound, rel=1e-6)
+
+
 def test_a_run_that_settles_far_from_the_values_settles_on_poor_ones() -> None:
     found = diagnose(one_weight(), line(0.5, 1.0))  # at 2, where the value is 10
     assert found.verdict == "stable but poor fixed point" and found.converges

@@ -27,12 +27,16 @@ import pytest
 import torch
 from PIL import Image
 
+import neuralq
 from neuralq.apps.cli import main
 from neuralq.apps.pages import star
 from neuralq.apps.pages.star import divergence_svg, growth_table, values_table, write_demo_report
 from neuralq.checks import MissingExtra
+from neuralq.learners import RolloutSettings
 from neuralq.mdp import FiniteMDP
+from neuralq.runs import RunConfig
 from neuralq.runs.folder.files import RunFolderError
+from neuralq.runs.recipe.config import config_to_dict
 from neuralq.runs.report import (
     learning_curve_svg,
     read_rows,
@@ -41,6 +45,7 @@ from neuralq.runs.report import (
 )
 from neuralq.runs.report.grid import grid_svg
 from neuralq.runs.report.readings import finite_series, first_not_finite, quartiles, standard_errors, thin
+from neuralq.runs.sweep import create_sweep
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
@@ -291,9 +296,12 @@ def test_a_summary_of_unpleasant_values_is_shown_as_far_as_it_goes(value: Any, t
 
 
 def test_a_sweep_has_a_page_whose_seeds_lead_to_theirs(tmp_path: Path) -> None:
-    words = "--seeds 2 --total-steps 64 --evaluation-episodes 2 --rollout.num-envs 2 --rollout.num-steps 16"
-    assert main(["train", "CartPole-v1", *words.split(), "--run-dir", str(tmp_path / "s")]) == 0
-    assert main(["report", str(tmp_path / "s" / "seed-1")]) == 0
+    settings = RolloutSettings(num_envs=2, num_steps=16)
+    config = RunConfig(env="CartPole-v1", total_steps=64, evaluation_episodes=2, rollout=settings)
+    create_sweep(tmp_path / "s", config_to_dict(config), (0, 1))
+    for seed in (0, 1):
+        neuralq.train(replace(config, seed=seed), tmp_path / "s" / f"seed-{seed}")
+        assert main(["report", str(tmp_path / "s" / f"seed-{seed}")]) == 0
     assert main(["report", str(tmp_path / "s")]) == 0
     page = (tmp_path / "s" / "report.html").read_text()
     outline = Outline(page)

@@ -242,7 +242,11 @@ def test_a_ctrl_c_that_was_swallowed_ends_the_command_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(cli.COMMANDS, "lab", cli.Command(__name__, "swallowing", "", ""))
-    assert cli.main(["lab"]) == 130
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    try:
+        assert cli.main(["lab"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert capsys.readouterr().err == "neuralq: interrupted\n"
 
 

@@ -134,6 +134,7 @@ def learn(learner: Learner, source: Source, num_steps: int, gamma: float, seed: 
     """
     check_whole("num_steps", num_steps)
     check_discount("gamma", gamma)
+    num_steps, gamma = int(num_steps), float(gamma)  # kernels are compiled anew for a 1 in the place of 1.0
     walk = new_walk(seed, options.max_episode_steps)
     log = new_log(num_steps if options.record_experience else 0, RECORD if options.record_experience else FORGET)
     later = _changed(source, options)

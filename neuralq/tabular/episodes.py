@@ -97,5 +97,5 @@ def _learner(
     check_whole("num_replayed", num_replayed, 0)
     check_whole("capacity", capacity)
     store = new_store(int(capacity), table.q.shape)
-    arguments = (step_size, store, order == "reverse", num_replayed)
+    arguments = (step_size, store, order == "reverse", int(num_replayed))
     return Learner(run_episodes, table, acting, arguments, backups=store.counters[BACKUPS:])

@@ -161,7 +161,7 @@ def dyna_learner(table: Table, policy: PolicyLike, step_size: StepCode, num_plan
     if not (math.isfinite(kappa) and kappa >= 0):
         raise ValueError(f"kappa must be a finite number of at least 0, got {kappa}")
     recall = dyna.new_recall(*table.q.shape)
-    arguments = (step_size, recall, num_planning, float(kappa), kappa > 0)
+    arguments = (step_size, recall, int(num_planning), float(kappa), kappa > 0)
     return Learner(dyna.run_dyna, table, acting, arguments, backups=recall.counters[dyna.BACKUPS :])
 
 
@@ -198,6 +198,6 @@ def sweeping_learner(
             room = memory.times.shape[1]
             raise ValueError(f"a pair had more than max_outcomes={room} different outcomes; raise max_outcomes")
 
-    arguments = (step_size, memory, kind, num_planning, float(threshold), bored, float(optimistic))
+    arguments = (step_size, memory, kind, int(num_planning), float(threshold), int(bored), float(optimistic))
     backups = memory.counters[sweeping.BACKUPS : sweeping.BACKUPS + 1]
     return Learner(sweeping.run_sweeping, table, acting, arguments, backups=backups, check=check)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from neuralq.jit import kernel
 from neuralq.systems.backgammon.kernels import Scratch, choose, equity_of, evaluate
 from neuralq.types import Array
-from neuralq_envs.backgammon.rules import ROLL_PROBABILITIES, ROLLS, Board, afterstates, result
+from neuralq_envs.backgammon.rules import ROLL_PROBABILITIES, ROLLS, Board, afterstates, copy_board, result
 
 __all__ = ["MAX_CANDIDATES", "WINDOW", "choose_two_ply", "look_ahead"]
 
@@ -68,20 +68,23 @@ def choose_two_ply(count: int, w: Array, v: Array, c: Array, s: Scratch) -> int:
 
     ``s.boards`` is overwritten from its beginning, but not the board that was chosen: that is written to its place.
     """
-    candidates, found = np.empty((MAX_CANDIDATES, 2, 25), np.int8), np.empty(MAX_CANDIDATES, np.int64)
     y = np.empty((count, c.size), w.dtype)
     evaluate(s.boards[:count], w, v, c, s, y)
     others = np.empty(count)
+    found, num_found = np.empty(MAX_CANDIDATES + 1, np.int64), 0  # the least for the others, in rising order
     for i in range(count):
         points = result(s.boards[i])
         others[i] = equity_of(y[i]) if points == 0 else float(points)
-    num_candidates, least = 0, others.min()
-    order = np.argsort(others, kind="mergesort")
-    for i in order[:MAX_CANDIDATES]:
-        if others[i] <= least + WINDOW:
-            candidates[num_candidates] = s.boards[i]
-            found[num_candidates] = i
-            num_candidates += 1
+        place = num_found
+        while place > 0 and others[i] < others[found[place - 1]]:
+            found[place] = found[place - 1]
+            place -= 1
+        found[place] = i
+        num_found = min(num_found + 1, MAX_CANDIDATES)
+    candidates, num_candidates = np.empty((MAX_CANDIDATES, 2, 25), np.int8), 0
+    while num_candidates < num_found and others[found[num_candidates]] <= others[found[0]] + WINDOW:
+        copy_board(s.boards[found[num_candidates]], candidates[num_candidates])
+        num_candidates += 1
     best, highest = 0, -np.inf
     ahead = np.empty(c.size)
     for n in range(num_candidates if num_candidates > 1 else 0):
@@ -91,5 +94,5 @@ def choose_two_ply(count: int, w: Array, v: Array, c: Array, s: Scratch) -> int:
             equity = look_ahead(candidates[n], w, v, c, s, ahead)
         if equity > highest:
             best, highest = n, equity
-    s.boards[found[best]] = candidates[best]
+    copy_board(candidates[best], s.boards[found[best]])
     return int(found[best])

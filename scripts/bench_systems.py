@@ -1,0 +1,108 @@
+"""What training the systems of the chapter costs, beside the same loops as the Python they are written in.
+
+    python scripts/bench_systems.py                     # every system
+    python scripts/bench_systems.py ase-ace --rounds 5
+    python scripts/bench_systems.py --json
+
+Each row is CPU time of one process with one thread, the median of some rounds without compilation. The Python side is
+the same code with ``NUMBA_DISABLE_JIT=1``, on a smaller amount of work, and is given for the whole. For example:
+
+    ase-ace          60 trials of ASE/ACE                                 0.00 s    Python       0.9 s     293x
+
+``--json`` prints one JSON object as the last line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Work(NamedTuple):
+    """One row: what is done, how to do so much of it, how much compiled and in Python, and what it may cost."""
+
+    summary: str
+    run: Callable[[int], object]
+    amount: int
+    python_amount: int
+    most_seconds: float | None = None
+
+
+def pole_ase_ace(num_trials: int) -> None:
+    from neuralq.systems.ase_ace.trials import train
+
+    train(0, long_trial_steps=10_000, most_failures=num_trials)
+
+
+def pole_q_lambda(num_trials: int) -> None:
+    from neuralq.systems.peng_williams.trials import Settings, train
+
+    train(0, Settings(0.5, long_trial_steps=10_000, most_failures=num_trials))
+
+
+WORK = {
+    "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
+    "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
+}
+
+
+def measured(name: str, rounds: int, python: bool) -> float:
+    """CPU seconds of the whole amount, in a process of its own."""
+    amount = WORK[name].python_amount if python else WORK[name].amount
+    command = [sys.executable, __file__, "--child", name, str(amount), str(1 if python else rounds)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_DISABLE_JIT": str(int(python))}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if ended.returncode != 0:
+        sys.exit(f"{name} failed:\n{ended.stderr}")
+    return float(ended.stdout.split()[-1]) * WORK[name].amount / amount
+
+
+def child(name: str, amount: int, rounds: int) -> None:
+    run = WORK[name].run
+    run(1)  # compiles
+    seconds = []
+    for _ in range(rounds):
+        began = time.process_time()
+        run(amount)
+        seconds.append(time.process_time() - began)
+    print(statistics.median(seconds))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(WORK)} (default: all)")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
+    parser.add_argument("--child", nargs=3, metavar=("NAME", "AMOUNT", "ROUNDS"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        name, amount, rounds = arguments.child
+        child(name, int(amount), int(rounds))
+        return
+    unknown = [name for name in arguments.names if name not in WORK]
+    if unknown:
+        parser.error(f"no such system: {', '.join(unknown)}; there are {', '.join(WORK)}")
+    found = {}
+    for name in arguments.names or WORK:
+        work = WORK[name]
+        compiled, python = measured(name, arguments.rounds, False), measured(name, arguments.rounds, True)
+        found[name] = {"seconds": compiled, "python_seconds": python, "most_seconds": work.most_seconds}
+        limit = "" if work.most_seconds is None else f"    (at most {work.most_seconds:g} s)"
+        ratio = python / max(compiled, 1e-9)
+        print(
+            f"{name:<16} {work.summary:<48} {compiled:8.2f} s    Python {python:9.1f} s  {ratio:6.0f}x{limit}",
+            flush=True,
+        )
+    if arguments.json:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
