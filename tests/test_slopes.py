@@ -145,7 +145,7 @@ ONE = np.zeros((1, 2))
         (lambda: LinearQuadraticEnv().step(0), ResetNeeded, "call reset"),
         (lambda: LinearQuadraticEnv(start_spread=0.0), ValueError, "start_spread must be"),
         (lambda: LinearQuadraticEnv("human"), ValueError, "render_mode must be one of"),
-        (lambda: LinearQuadraticEnv().reset(options={"state": (1, np.inf)}), ValueError, "two finite numbers"),
+        (lambda: LinearQuadraticEnv().reset(options={"state": (1, np.inf)}), ValueError, "a velocity within"),
         (lambda: action_values([0.0, 0.0], 3), ValueError, "a must be one of 0, 1, 2"),
         (lambda: action_values([0.0, 0.0], 0, gamma=1.5), ValueError, "gamma must lie in"),
         (lambda: fits.fit(np.random.SeedSequence(0), "none of these"), ValueError, "source must be one of"),
@@ -181,7 +181,7 @@ def test_what_is_explained_is_the_chain_along_what_was_seen() -> None:
 @pytest.mark.parametrize("num_steps", [300, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_the_task_keeps_its_word_for_many_random_steps(num_steps: int) -> None:
     env = gymnasium.make("neuralq/LinearQuadratic-v0")
-    check_env(LinearQuadraticEnv(render_mode="rgb_array"))
+    check_env(gymnasium.make("neuralq/LinearQuadratic-v0", render_mode="rgb_array").unwrapped)
     rng = np.random.default_rng(0)
     s, _ = env.reset(seed=0)
     starts = [s]
@@ -191,10 +191,21 @@ def test_the_task_keeps_its_word_for_many_random_steps(num_steps: int) -> None:
         assert s_t.tolist() == pytest.approx([s[0] + 0.2 * s[1], 0.9 * s[1] + 0.3 * u], abs=1e-12)
         assert reward == pytest.approx(-(s[0] ** 2) - 0.1 * s[1] ** 2) and not terminated
         s = s_t
+        assert s in env.observation_space
         if truncated:
             s, _ = env.reset()
             starts.append(s)
     assert (np.abs(starts) <= 1).all() and len(starts) == 1 + num_steps // 100
+
+
+def test_the_line_ends() -> None:
+    env = LinearQuadraticEnv()
+    s, _ = env.reset(options={"state": (99.0, 60.0)})
+    assert s in env.observation_space
+    s, _, terminated, truncated, _ = env.step(LAW)
+    assert truncated and not terminated and s in env.observation_space
+    with pytest.raises(ResetNeeded, match="off its line"):
+        env.step(LAW)
 
 
 def test_the_task_can_be_looked_at() -> None:

@@ -43,6 +43,10 @@ _A = np.array([[1.0, 0.2], [0.0, 0.9]])
 _B = np.array([0.0, 0.3])
 _C = np.diag([1.0, 0.1])
 _K = np.array([0.8, 1.0])
+_END = 100.0  # of the line
+# The law turns a velocity v at position x into .6 v - .24 x, a push into .9 v at most .3 more: 60 is never passed.
+_FASTEST = 60.0
+_HIGHEST = np.array([_END + 0.2 * _FASTEST, _FASTEST])
 _REACH = 3.0  # of the picture, in units of the state
 _SIZE = 240  # pixels
 _COLUMNS = 61
@@ -109,7 +113,7 @@ def action_value_slopes(s: ArrayLike, a: int, gamma: float = GAMMA) -> NDArray[n
 
 
 class LinearQuadraticEnv(gymnasium.Env[Any, Any]):
-    """The mass on its line; observations are position and velocity. Episodes never end by themselves.
+    """The mass on its line; observations are position and velocity. Only the ends of the line, at ±100, truncate.
 
     Args:
         render_mode: None, ``"ansi"`` or ``"rgb_array"``.
@@ -130,7 +134,7 @@ class LinearQuadraticEnv(gymnasium.Env[Any, Any]):
         check_choice("render_mode", render_mode, [None, *self.metadata["render_modes"]])
         check_positive("start_spread", start_spread)
         self.render_mode = render_mode
-        self.observation_space = Box(-np.inf, np.inf, (2,), np.float64)
+        self.observation_space = Box(-_HIGHEST, _HIGHEST, dtype=np.float64)
         self.action_space = Discrete(3)
         self._spread = float(start_spread)
         self._state: NDArray[np.float64] | None = None
@@ -141,14 +145,15 @@ class LinearQuadraticEnv(gymnasium.Env[Any, Any]):
         """Starts anywhere within the spread, or in ``options["state"]``.
 
         Raises:
-            ValueError: a state that is not two finite numbers.
+            ValueError: a state that is not a position on the line and a velocity within ±60.
         """
         super().reset(seed=seed)
         if options is not None and "state" in options:
             given = np.array(options["state"], np.float64)
-            if given.shape != (2,) or not np.isfinite(given).all():
+            if given.shape != (2,) or not (np.abs(given) <= (_END, _FASTEST)).all():
                 raise ValueError(
-                    f"options['state'] must be two finite numbers (position, velocity), got {options['state']!r}"
+                    f"options['state'] must be a position within ±{_END:g} and a velocity within ±{_FASTEST:g}, "
+                    f"got {options['state']!r}"
                 )
             self._state = given
         else:
@@ -159,16 +164,16 @@ class LinearQuadraticEnv(gymnasium.Env[Any, Any]):
         """Pushes left (0), follows the law (1) or pushes right (2).
 
         Raises:
-            ResetNeeded: before the first reset.
+            ResetNeeded: before the first reset, or beyond the end of the line.
             ValueError: another action.
         """
-        if self._state is None:
-            raise ResetNeeded("the mass has not been set up yet: call reset() before step()")
+        if self._state is None or abs(self._state[0]) > _END:
+            raise ResetNeeded("the mass is off its line, or has not been set up yet: call reset() before step()")
         if not self.action_space.contains(action):
             raise ValueError(f"action must be 0 (push left), 1 (follow the law) or 2 (push right), got {action!r}")
         reward = float(rewards(self._state))
         self._state = successors(self._state, int(action))
-        return self._state.copy(), reward, False, False, {}
+        return self._state.copy(), reward, False, bool(abs(self._state[0]) > _END), {}
 
     def render(self) -> Any:
         """Text for ``ansi``, uint8 ``[H, W, 3]`` for ``rgb_array``, None without a render mode or before a reset."""

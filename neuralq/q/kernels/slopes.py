@@ -10,6 +10,7 @@ b, c, c₀; (d + 2) H + 1 numbers.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ def slope_gradient(
     gradient: NDArray[np.float64],
     hidden: NDArray[np.float64],
     error: NDArray[np.float64],
-) -> float:
+) -> Any:
     """Writes the gradient of the mean loss and returns the loss.
 
     Args:

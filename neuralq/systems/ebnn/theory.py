@@ -68,7 +68,7 @@ def observe(s: Array) -> tuple[Array, Array]:
 
     Example:
         >>> left, returns = observe(np.array([[1.0, 0.0]]))
-        >>> left.shape, left[1].tolist(), bool(-3 < returns[0] < -2)
+        >>> left.shape, left[1].tolist(), bool(-6 < returns[0] < -5)
         ((30, 1, 2), [[1.0, 0.3]], True)
     """
     left = [s, successors(s, PUSH)]
