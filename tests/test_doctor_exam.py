@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch import nn
 
-from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, signs, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
@@ -303,7 +303,7 @@ def test_what_is_hidden_is_what_the_past_tells_more() -> None:
 
 def two_layers(units: int, seed: int = 0) -> nn.Sequential:
     net = nn.Sequential(nn.Linear(2, units), nn.ReLU(), nn.Linear(units, 2))
-    return network.fresh(net, np.random.default_rng(seed))  # type: ignore[return-value]
+    return signs.fresh(net, np.random.default_rng(seed))  # type: ignore[return-value]
 
 
 def noisy() -> gym.Env[Any, Any]:
