@@ -41,14 +41,45 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def fit_to_slopes(num_steps: int) -> None:
+    import numpy as np
+
+    from neuralq.learners import fit_slopes, new_slope_net
+
+    rng = np.random.default_rng(0)
+    s, slope = rng.normal(size=(2, 20, 2))
+    fit_slopes(new_slope_net(2, 10, rng), s, rng.normal(size=20), slope, num_steps=num_steps)
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
     train(0, Settings(0.5, long_trial_steps=10_000, most_failures=num_trials))
 
 
+def checkers_learning(num_games: int) -> None:
+    from neuralq.systems.checkers.training import train
+
+    train(0, num_games)
+
+
+def checkers_perft(num_positions: int) -> None:
+    """Ways to play nine moves, as those to play six from each of the 302 boards after three."""
+    from neuralq_envs.checkers import Position
+    from neuralq_envs.checkers.rules import perft
+
+    boards = [Position.initial()]
+    for _ in range(3):
+        boards = [move.position for board in boards for move in board.moves()]
+    ways = sum(perft(one.own, one.other, one.kings, 6) for one in boards[:num_positions])
+    assert num_positions < len(boards) or ways == 3_963_680
+
+
 WORK = {
     "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
+    "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
+    "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
+    "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }
 

@@ -76,7 +76,13 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 
 
 # Loops of whole systems take long to compile: their tests are run by `make systems`, which CI does too.
-SYSTEMS = ("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run")
+SYSTEMS = (
+    "test_backgammon_fuzz",
+    "test_backgammon_learning",
+    "test_backgammon_match",
+    "test_backgammon_run",
+    "test_checkers_learning",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -15,7 +15,7 @@ from torch import nn
 from neuralq.doctor import Settings, examine
 from neuralq.doctor.exam.capacity import t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
-from neuralq.doctor.exam.network import fresh
+from neuralq.doctor.exam.signs import fresh
 from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, fit
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.play import Clock

@@ -32,8 +32,8 @@ from torch import nn
 
 from neuralq.doctor.exam.capacity import labelled, regressed, t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case
-from neuralq.doctor.exam.network import fresh
 from neuralq.doctor.exam.retraining import further_reach, in_words, settings_of
+from neuralq.doctor.exam.signs import fresh
 from neuralq.doctor.findings import Cause, Finding
 from neuralq.runs import train
 from neuralq.runs.recipe.stand_in import Maker

@@ -278,7 +278,7 @@ class Session:
         found, seen = self.play_greedily(seed), self.stream.normalisation
         statistics = None if seen is None else seen.state_dict()
         columns: dict[str, Any] = {"greedy_return": found.mean, "returns": list(found.returns)}
-        columns["num_cut"] = found.num_cut
+        columns |= {"lengths": list(found.lengths), "num_cut": found.num_cut}
         if self.evaluation_max_steps is None:
             columns["max_steps"] = self._cap()
         columns |= measured | self._beside_exact()

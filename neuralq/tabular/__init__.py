@@ -17,7 +17,9 @@ from neuralq.tabular.control import apply, double_q, expected_sarsa, q_learning,
 from neuralq.tabular.engine import RunOptions
 from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
 from neuralq.tabular.kernels.ase_ace import AseAce, AseAceRates, ase_ace_action, ase_ace_update, new_ase_ace
+from neuralq.tabular.kernels.backups import BackupRule, backup_update
 from neuralq.tabular.kernels.random_numbers import new_stream
+from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
@@ -39,6 +41,8 @@ from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 __all__ = [
     "AseAce",
     "AseAceRates",
+    "Backup",
+    "BackupRule",
     "Band",
     "Curve",
     "EpsilonGreedy",
@@ -54,12 +58,14 @@ __all__ = [
     "Sweeps",
     "UpperConfidence",
     "Visits",
+    "alpha_beta",
     "apply",
     "apply_episodes",
     "apply_lambda",
     "apply_n_step",
     "ase_ace_action",
     "ase_ace_update",
+    "backup_update",
     "batch_td",
     "compile_model",
     "double_q",

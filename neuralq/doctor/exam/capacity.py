@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from neuralq.doctor.estimates import bounds_of, held_out_scores
 from neuralq.doctor.exam.case import CannotMeasure, Case
-from neuralq.doctor.exam.network import fresh, hidden
+from neuralq.doctor.exam.signs import fresh, hidden
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.play import returns_from
 from neuralq.types import Array, Floats
@@ -43,7 +43,10 @@ def capacity(case: Case) -> Finding:
         rng = case.rng(320 + seed)
         held = np.isin(names, rng.permutation(np.unique(names))[: len(np.unique(names)) // 2])
         divisions.append((held, fresh(network, rng), _by_features(with_action, g, held, rng), rng))
-    scores = [(_untrained(case, net, theirs, a, g, held), other) for held, net, other, _ in divisions]
+    scores = [
+        (_untrained(net, outputs, theirs, np.eye(case.world.num_actions)[a], g, held), other)
+        for held, net, other, _ in divisions
+    ]
     if np.mean([other - own for own, other in scores]) > _GAP:  # training may do better than the layers it starts from
         if case.clock.left < 0.3 * case.clock.budget_s:
             raise CannotMeasure("it trains fresh networks, for which too little of the budget was left")
@@ -61,14 +64,16 @@ def capacity(case: Case) -> Finding:
     )  # fmt: skip
 
 
-def _untrained(case: Case, net: nn.Module, x: Tensor, a: Array, g: Floats, held: Array) -> float:
+def _untrained(
+    net: nn.Module, outputs: Callable[[nn.Module, Tensor], Tensor], x: Tensor, chosen: Floats, g: Floats, held: Array
+) -> float:  # fmt: skip
     """R² on the held-out rows of a least squares fit on the last hidden layer as it starts; −1 without one."""
     try:
-        h = hidden(case, net, x)[-1].double().numpy()
+        h = hidden(net, outputs, x)[-1].double().numpy()
     except CannotMeasure:
         return -1.0
     rows = np.concatenate([np.ones((len(h), 1)), h / max(float(np.abs(h).mean()), 1e-300)], axis=1)
-    each = (np.eye(case.world.num_actions)[a][:, :, None] * rows[:, None, :]).reshape(len(h), -1)
+    each = (chosen[:, :, None] * rows[:, None, :]).reshape(len(h), -1)
     gram = each[~held].T @ each[~held] + 1e-4 * (~held).sum() * np.eye(each.shape[1])
     predicted = each[held] @ np.linalg.solve(gram, each[~held].T @ g[~held])
     return _explained(g[held], predicted)

@@ -22,7 +22,7 @@ from neuralq.runs.recipe.config import RunConfig, config_from_dict
 from neuralq.runs.recipe.stand_in import nameless
 from neuralq.types import Array
 
-__all__ = ["NEURALQ_RUN", "of_agent"]
+__all__ = ["NEURALQ_RUN", "of_agent", "settings_of_run"]
 
 
 def _load(path: Path, net: str | None, env: Any) -> Subject:
@@ -76,14 +76,26 @@ def of_agent(agent: Agent) -> Subject:
 
 
 def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
+    rows = [row for row in read_metrics(path) if isinstance(row.get("env_steps"), int)]
+    return settings_of_run(config, float(max((row["env_steps"] for row in rows), default=0)) or None, reward_scale)
+
+
+def settings_of_run(config: RunConfig, env_steps: float | None, reward_scale: float | None = None) -> Settings:
+    """How a run was trained, or will have been, after so many steps.
+
+    Args:
+        config: of the run.
+        env_steps: environment steps; None where that is not known.
+        reward_scale: as `Settings` has it.
+
+    Example:
+        >>> settings_of_run(RunConfig(learner="rollout"), 1000.0).lambda_
+        0.65
+    """
     own = config.settings
     traits = config.kind.traits(own)
-    rows = [row for row in read_metrics(path) if isinstance(row.get("env_steps"), int)]
-    env_steps = float(max((row["env_steps"] for row in rows), default=0)) or None
-    seen = [row["updates"] for row in rows if isinstance(row.get("updates"), int | float)]
     per_step = getattr(own, "updates_per_period", 1) / getattr(own, "train_period", 1)
     learned = None if env_steps is None else max(env_steps - getattr(own, "learning_starts", 0), 0)
-    updates = float(max(seen)) if seen else None if learned is None else learned * per_step
     capacity, batch, starts = (getattr(own, name, None) for name in ("capacity", "batch_size", "learning_starts"))
     return Settings(
         gamma=config.gamma,
@@ -91,7 +103,7 @@ def _settings(config: RunConfig, path: Path, reward_scale: float) -> Settings:
         num_steps=float(getattr(own, "num_steps", 1)) if traits.replay else 1.0,
         lambda_=traits.lambda_,
         target_period_updates=float(traits.target_period or 1),
-        updates=updates,
+        updates=None if learned is None else learned * per_step,
         env_steps=env_steps,
         batch_size=None if batch is None else float(batch),
         capacity=None if capacity is None else float(capacity),

@@ -34,6 +34,7 @@ from torch import nn
 from neuralq.checks import check_positive, check_whole
 from neuralq.lab.watch.advice import RunTraits, advise
 from neuralq.lab.watch.growth import GrowthFit, fit_growth
+from neuralq.lab.watch.samples import held_rows, largest_return
 from neuralq.learners import Learner
 from neuralq.runs import RunConfig
 from neuralq.runs.stream.experience import Sample
@@ -194,7 +195,7 @@ class DivergenceMonitor:
         return self._share is None or self.cpu_seconds + seconds <= self._share * self._run_seconds
 
     def _observe(self, learner: Learner, sample: Sample) -> None:
-        rows = _held_rows(sample)
+        rows = held_rows(sample)
         if not len(rows.a_tm1):
             return
         few = self._rng.permutation(len(rows.a_tm1))[: self._num_samples]
@@ -342,14 +343,7 @@ class DivergenceMonitor:
             return None
 
     def _note_rewards(self, sample: Sample) -> None:
-        gamma, most, scale = self.traits.gamma, self._seen_bound * (1 - self.traits.gamma), sample.reward_scale
-        if gamma == 1 or not float(sample.transition.r_t.abs().max()) / scale > most:  # most of the time, and cheap
-            return
-        rows = _held_rows(sample)
-        # A row of n steps is discounted by γⁿ: |Σ γᵏ r| / (1 − γⁿ) ≤ r_max / (1 − γ).
-        share = torch.where(rows.discount_t > 0, 1 - rows.discount_t.double(), 1 - gamma)
-        sizes = rows.r_t.double().abs() / scale / share.clamp(min=1 - gamma)
-        self._seen_bound = max(self._seen_bound, float(sizes.max()) if len(sizes) else 0.0)
+        self._seen_bound = largest_return(sample, self.traits.gamma, self._seen_bound)
 
     def columns(self) -> dict[str, Any]:
         """What rows of metrics are to say: the alarms so far, by kind, or None."""
@@ -421,12 +415,3 @@ class DivergenceMonitor:
         if self.alarms:
             parts.append(f"What may help: {'; '.join(self.alarms[-1].advice)}.")
         return " ".join(part.strip() for part in parts)
-
-
-def _held_rows(sample: Sample) -> Transition:
-    """The rows that are experience, with one leading axis."""
-    axes = sample.transition.a_tm1.dim()
-    flat = sample.transition.map(lambda x: x.reshape(-1, *x.shape[axes:]))
-    if sample.weight is None or sample.indices is not None:
-        return flat
-    return flat.map(lambda x: x[sample.weight.reshape(-1).to(x.device) > 0])

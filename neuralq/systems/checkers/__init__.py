@@ -1,0 +1,6 @@
+"""Samuel 1959: checkers learned from what its own look-ahead says, and by rote."""
+
+from neuralq.systems.checkers.player import LEARNED, CheckersPlayer, RankedMove
+from neuralq.systems.checkers.system import CHECKERS
+
+__all__ = ["CHECKERS", "LEARNED", "CheckersPlayer", "RankedMove"]
