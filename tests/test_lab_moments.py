@@ -159,7 +159,6 @@ def test_stability_is_the_same_by_a_linear_system_and_by_eigenvalues(monkeypatch
     for most, by_eigenvalues in ((num_unknowns, False), (num_unknowns - 1, True)):
         asked: list[int] = []
         monkeypatch.setattr(moments, "LARGEST_DENSE", most)
-    monkeypatch.setattr(moments, "_leading", lambda one, power: one.M[0, 0] ** power)  # ARPACK wants more than one number
         monkeypatch.setattr(
             moments, "_leading", lambda one, moment, asked=asked: asked.append(1) or leading(one, moment)
         )
@@ -341,7 +340,8 @@ def test_every_class_of_a_chain_has_to_settle(
 ) -> None:
     """Two rows, each of which leads to itself; by a linear system, and by eigenvalues."""
     monkeypatch.setattr(moments, "LARGEST_DENSE", most)
-    monkeypatch.setattr(moments, "_leading", lambda one, power: one.M[0, 0] ** power)  # ARPACK wants more than one number
+    # ARPACK wants more than one number.
+    monkeypatch.setattr(moments, "_leading", lambda one, power: one.M[0, 0] ** power)
     M, each, half = np.array([[[first]], [[second]]]), np.arange(2), np.full(2, 0.5)
     maps = UpdateMaps(M, np.zeros((2, 1)), each, each, np.ones(2), half, half)
     assert second_moment_stable(maps, "markov") == (max(first, second) < 1)
