@@ -167,7 +167,9 @@ def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["healthy"] is False and said["report"] == str(page) and page.is_file()
-    assert {"R1", "R2", "R6a"} <= {one["id"] for one in said["measured"]}
+    beside = {one["id"]: one["fresh"] for one in said["measured"] if one["fresh"]}
+    assert set(beside) == {"R1", "R2", "R3", "R4", "R6a"} and {len(of_eight) for of_eight in beside.values()} == {8}
+    assert 'id="signs"' in (text := page.read_text(encoding="utf-8")) and "of fresh networks" in text
 
 
 @pytest.mark.usefixtures("without_training")

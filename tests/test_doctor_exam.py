@@ -320,6 +320,9 @@ def test_dormant_units_are_counted_and_fresh_networks_are_not_flagged() -> None:
         net[0].bias[40:] = 1.0  # type: ignore[index]
     dead = network.dormant(case_of(noisy, net))
     assert dead.flagged and "80 % of hidden units" in dead.evidence
+    assert dead.fresh == healthy.fresh and sum(healthy.fresh) == pytest.approx(0, abs=1e-9)  # about their mean
+    assert max(dead.fresh) < 0.2 < dead.value and healthy.interval is not None
+    assert healthy.interval[0] == pytest.approx(healthy.value - max(healthy.fresh))
 
 
 def test_effective_rank_of_units_that_all_say_the_same_is_one() -> None:
@@ -329,7 +332,7 @@ def test_effective_rank_of_units_that_all_say_the_same_is_one() -> None:
         net[0].weight[:] = net[0].weight[0]  # type: ignore[index]
         net[0].bias[:] = net[0].bias[0]  # type: ignore[index]
     same = network.effective_rank(case_of(noisy, net))
-    assert same.value == 1 and same.flagged
+    assert same.value == 1 and same.flagged and (min(same.fresh), max(same.fresh)) == same.interval
 
 
 def test_weights_that_never_moved_are_known() -> None:
@@ -339,6 +342,7 @@ def test_weights_that_never_moved_are_known() -> None:
         net[2].weight *= 3  # a third of them stays where all were
     moved = network.untouched(case_of(noisy, net))
     assert not moved.flagged and moved.value > 2
+    assert moved.threshold == 1.5 * max(moved.fresh) and len(moved.fresh) == 8
 
 
 def test_lag_is_relative_and_weights_that_are_not_finite_are_named() -> None:

@@ -17,6 +17,8 @@ a representation with one output, which bounds its step, or `PredictionLearner`,
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
 
+`fit_slopes` fits a small network to values and slopes at once, for whoever has a model that explains what was seen.
+
 A learner that runs can be made of ends with its `LearnerKind`; `learner_kinds` finds it, and nothing else lists it.
 """
 
@@ -39,6 +41,7 @@ from neuralq.learners.semi_markov import (
     smdp_network_update,
     smdp_network_values,
 )
+from neuralq.learners.slopes import SlopeNet, fit_slopes, new_slope_net
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.learners.tabular.settings import TabularSettings
 from neuralq.learners.traces.learner import OnlineLearner, OnlineSettings, PredictionLearner
@@ -68,6 +71,7 @@ __all__ = [
     "ResidualGradientSettings",
     "RolloutLearner",
     "RolloutSettings",
+    "SlopeNet",
     "SmdpNetwork",
     "StreamingLearner",
     "StreamingSettings",
@@ -77,7 +81,9 @@ __all__ = [
     "Traits",
     "TwinHead",
     "Update",
+    "fit_slopes",
     "learner_kinds",
+    "new_slope_net",
     "new_smdp_network",
     "smdp_network_update",
     "smdp_network_values",

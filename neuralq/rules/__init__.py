@@ -29,6 +29,7 @@ from neuralq.rules.returns import (
 )
 from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
 from neuralq.rules.semi_markov import smdp_discount
+from neuralq.rules.slopes import input_slopes, lob_star, return_slopes, squared_slopes
 from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule, target_rules
 from neuralq.rules.targets import (
     double_q,
@@ -65,9 +66,11 @@ __all__ = [
     "greedy",
     "greedy_random_ties",
     "huber",
+    "input_slopes",
     "is_greedy",
     "k_to_the_q",
     "lambda_returns",
+    "lob_star",
     "munchausen",
     "munchausen_bonus",
     "n_step_returns",
@@ -79,6 +82,7 @@ __all__ = [
     "replace",
     "residual_gradient_error",
     "retrace_coefficients",
+    "return_slopes",
     "sample",
     "sarsa",
     "semi_gradient_error",
@@ -86,6 +90,7 @@ __all__ = [
     "soft_value",
     "softmax",
     "squared",
+    "squared_slopes",
     "target_rules",
     "tree_backup_coefficients",
     "true_online_increment",
