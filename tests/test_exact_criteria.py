@@ -185,6 +185,14 @@ def long_run(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return lazy
 
 
+def test_a_class_counts_wherever_the_end_stands_among_them() -> None:
+    """0 ends, 1 and 2 lead to each other: the end is a class too, and here not the last."""
+    chain = [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    found = evaluate_average(FiniteMDP.from_arrays([chain], [[1.0], [2.0], [3.0]], substochastic=True), [0, 0, 0])
+    assert found.gain.tolist() == [0.0, 2.5, 2.5] and found.bias == pytest.approx([1.0, -0.25, 0.25])
+    assert (found.recurrent_class >= 0).tolist() == [False, True, True]
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_average_reward_by_enumeration(seed: int) -> None:
