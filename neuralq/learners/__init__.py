@@ -10,6 +10,8 @@ Prediction is control with one action. True online TD(λ) is `PredictionLearner`
 linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
 a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
 
+`smdp_network_update` learns from actions that last, in compiled loops, for `neuralq.systems`.
+
 `TabularLearner` runs the compiled loops of `neuralq.tabular`: every algorithm of the chapter on a table.
 
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
@@ -33,6 +35,12 @@ from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
+from neuralq.learners.semi_markov import (
+    SmdpNetwork,
+    new_smdp_network,
+    smdp_network_update,
+    smdp_network_values,
+)
 from neuralq.learners.slopes import SlopeNet, fit_slopes, new_slope_net
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.learners.tabular.settings import TabularSettings
@@ -64,6 +72,7 @@ __all__ = [
     "RolloutLearner",
     "RolloutSettings",
     "SlopeNet",
+    "SmdpNetwork",
     "StreamingLearner",
     "StreamingSettings",
     "TabularLearner",
@@ -75,4 +84,7 @@ __all__ = [
     "fit_slopes",
     "learner_kinds",
     "new_slope_net",
+    "new_smdp_network",
+    "smdp_network_update",
+    "smdp_network_values",
 ]
