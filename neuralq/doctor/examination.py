@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
-from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, seeds, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
 from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
@@ -64,6 +64,7 @@ _MEASUREMENTS: dict[str, Measurement] = {
     "V6a": values.better_actions,
     "R7": capacity.capacity,
     "R5": network.plasticity,
+    "X5": seeds.luck,
 }
 NUM_PARTS = len(_MEASUREMENTS) + 2
 """Of an examination: the measurements, and twice episodes are played."""
@@ -161,14 +162,18 @@ def _examined(
         return _broken(subject, world, gamma, clock, str(error))
     measured, missing = _measured(case, say)
     findings, headline = decide(measured)
-    drawn = _drawn(case)
+    drawn, why = _drawn(case), ""
     if seeds:
         tried = run_experiments(case, [one for one in findings if one.grade in "AB"], seeds, say)
-        measured, missing = [*measured, *tried.findings], {**missing, **tried.missing}
+        measured = [*measured, *tried.findings]
+        missing = {name: why for name, why in missing.items() if name != "X5"} | tried.missing
         findings, headline = decide(measured)
+        why = tried.why
         if tried.factorial is not None:
             drawn["factorial"] = tried.factorial
-    return Report(subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, drawn)
+    return Report(
+        subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, drawn, why
+    )
 
 
 def _measured(case: Case, say: _Teller) -> tuple[list[Finding], dict[str, str]]:

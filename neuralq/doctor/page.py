@@ -48,6 +48,9 @@ def page_of(report: Report) -> Page:
             page.table(_found(one))
     _figures(page, report)
     _vital_signs(page, report)
+    if report.experiments:
+        page.heading("Experiments")
+        page.paragraph(f"In the order {report.experiments}.")
     _factorial(page, report)
     page.heading("What was not measured, and why")
     if report.not_measured:
