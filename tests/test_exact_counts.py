@@ -131,6 +131,15 @@ def test_sweeps_of_a_policy_are_counted(gamma: float) -> None:
         assert counts(solve(slow.mdp, gamma, "modified-policy-iteration", tol), slow) == expected
 
 
+def test_the_error_of_a_factored_evaluation_grows_with_the_steps_that_it_looks_ahead() -> None:
+    mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]])
+    for gamma in (0.5, 0.999):
+        problem = prepare(mdp, gamma)
+        v, error, sweeps = policy_values(problem, np.arange(2), np.zeros(2))
+        assert v == pytest.approx([1 / (1 - gamma**2), gamma / (1 - gamma**2)]) and sweeps == 0
+        assert error == pytest.approx(2 / (1 - gamma) * problem.rounding(v))
+
+
 def test_a_span_that_falls_no_more_is_waited_for_twenty_times() -> None:
     problem = prepare(FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]]), 1 - 1e-6)
 
