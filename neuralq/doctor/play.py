@@ -132,7 +132,7 @@ def legal_in(info: Mapping[str, Any], num_actions: int) -> Array:
     """
     if "action_mask" not in info:
         return np.ones(num_actions, bool)
-    legal = np.asarray(info["action_mask"]) != 0
+    legal: Array = np.asarray(info["action_mask"]) != 0
     if legal.shape != (num_actions,):
         raise EnvironmentRaised(
             f"info['action_mask'] has the shape {list(legal.shape)}, and there are {num_actions} actions"

@@ -106,14 +106,16 @@ def greedy_of(values: Floats, legal: Array) -> Indices:
         >>> greedy_of(np.array([[3.0, 1.0, np.nan]]), np.array([[False, True, True]])).tolist()
         [1]
     """
-    return np.where(legal, np.nan_to_num(values, nan=-np.inf), -np.inf).argmax(1)
+    best: Indices = np.where(legal, np.nan_to_num(values, nan=-np.inf), -np.inf).argmax(1)
+    return best
 
 
 def any_of(legal: Array, rng: np.random.Generator) -> Indices:
     """One of the legal actions of each row, all as likely: ``[N, A] -> [N]``."""
     if legal.all():
         return rng.integers(legal.shape[1], size=len(legal))
-    return np.where(legal, rng.random(legal.shape), -1.0).argmax(1)
+    drawn: Indices = np.where(legal, rng.random(legal.shape), -1.0).argmax(1)
+    return drawn
 
 
 def legal_at(episodes: Sequence[Episode], steps: Indices, later: int = 0) -> Array | None:

@@ -62,7 +62,7 @@ def _legal_only(case: Case, outputs: Outputs) -> Outputs:
     shape = case.subject.encode(case.greedy[0].observations[:1]).shape[1:]
 
     def legal(network: nn.Module, x: Tensor) -> Tensor:
-        seen, mask = x.split([x.shape[-1] - case.world.num_actions, case.world.num_actions], dim=-1)
+        seen, mask = x[..., : -case.world.num_actions], x[..., -case.world.num_actions :]
         return outputs(network, seen.reshape(*x.shape[:-1], *shape)).masked_fill(mask == 0, -torch.inf)
 
     return legal
