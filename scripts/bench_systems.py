@@ -41,6 +41,24 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def elevators(num_hours: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.elevators.training import Settings, train
+
+    train(np.random.SeedSequence(0), Settings(num_hours))
+
+
+def fit_to_slopes(num_steps: int) -> None:
+    import numpy as np
+
+    from neuralq.learners import fit_slopes, new_slope_net
+
+    rng = np.random.default_rng(0)
+    s, slope = rng.normal(size=(2, 20, 2))
+    fit_slopes(new_slope_net(2, 10, rng), s, rng.normal(size=20), slope, num_steps=num_steps)
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
@@ -69,6 +87,8 @@ WORK = {
     "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
     "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
+    "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
+    "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ from neuralq.apps.cli import main
 from neuralq.doctor import CannotLoad, Finding, Report, examination, examine
 from neuralq.doctor.examination import NUM_PARTS
 from neuralq.doctor.findings import CAUSES
+from neuralq.learners import RolloutSettings
+from neuralq.runs import RunConfig, train
+from neuralq.runs.folder.files import read_json, to_json
+from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.sweep import create_sweep
 
 GAMMA = 0.9
 FROZEN = {"env": "FrozenLake-v1", "env_kwargs": {"is_slippery": False}}
@@ -167,7 +173,9 @@ def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["healthy"] is False and said["report"] == str(page) and page.is_file()
-    assert {"R1", "R2", "R6a"} <= {one["id"] for one in said["measured"]}
+    beside = {one["id"]: one["fresh"] for one in said["measured"] if one["fresh"]}
+    assert set(beside) == {"R1", "R2", "R3", "R4", "R6a"} and {len(of_eight) for of_eight in beside.values()} == {8}
+    assert 'id="signs"' in (text := page.read_text(encoding="utf-8")) and "of fresh networks" in text
 
 
 @pytest.mark.usefixtures("without_training")
@@ -211,6 +219,31 @@ def test_the_command_exits_with_0_where_all_is_well(
     torch.save({"scale": torch.ones(1)}, "ones.pth")
     status = main(["doctor", "ones.pth", "--net", "ones:Net", "--env", "ones:World", "--gamma", "0"])
     assert status == 0 and "Healthy" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("without_training")
+@pytest.mark.parametrize("best", [500.0, 9.5])
+def test_of_a_sweep_the_worst_seed_is_examined_and_what_the_others_return_says_whether_it_was_luck(
+    tmp_path: Path, best: float
+) -> None:
+    """Two seeds that learned next to nothing; of one of them its summary says otherwise, or the same."""
+    config = RunConfig(
+        total_steps=64, evaluation_episodes=1, epsilon_decay_steps=64, rollout=RolloutSettings(num_envs=2, num_steps=16)
+    )  # fmt: skip
+    sweep = create_sweep(tmp_path / "sweep", config_to_dict(config), (0, 1))
+    with pytest.raises(CannotLoad, match=f"neuralq resume {sweep.path}"):
+        examine(str(sweep.path))
+    for seed in sweep.seeds:
+        train(dataclasses.replace(config, seed=seed), sweep.run_path(seed))
+        path = sweep.run_path(seed) / "summary.json"
+        told = {**read_json(path), "greedy_return": best if seed == 0 else 9.0, "play_off": None}
+        path.write_text(to_json(told, "summary", sealed=True))
+    report = examine(sweep.path, budget_s=20)
+    luck = next(one for one in report.measured if one.id == "X5")
+    assert report.subject.startswith("seed 1, the worst of 2") and luck.value == (0.5 if best == 500 else 0)
+    assert luck.flagged == (best == 500) and ("X5" in report.headline) == (best == 500)
+    if best == 500:
+        assert report.cause == "luck" and "neuralq train CartPole-v1 --seeds 5" in luck.confirm
 
 
 @pytest.mark.usefixtures("without_training")

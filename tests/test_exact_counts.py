@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neuralq.exact import Solution, policies, solve
+from neuralq.exact import Solution, policies, solve, sweeping
 from neuralq.exact.policies import policy_values
 from neuralq.exact.problem import prepare
 from neuralq.mdp import FiniteMDP
@@ -129,6 +129,30 @@ def test_sweeps_of_a_policy_are_counted(gamma: float) -> None:
                     break
         expected = improvements, improvements * slow.rows + 20 * sweeps
         assert counts(solve(slow.mdp, gamma, "modified-policy-iteration", tol), slow) == expected
+
+
+def test_the_error_of_a_factored_evaluation_grows_with_the_steps_that_it_looks_ahead() -> None:
+    mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]])
+    for gamma in (0.5, 0.999):
+        problem = prepare(mdp, gamma)
+        v, error, sweeps = policy_values(problem, np.arange(2), np.zeros(2))
+        assert v == pytest.approx([1 / (1 - gamma**2), gamma / (1 - gamma**2)]) and sweeps == 0
+        assert error == pytest.approx(2 / (1 - gamma) * problem.rounding(v))
+
+
+def test_a_span_that_falls_no_more_is_waited_for_twenty_times() -> None:
+    problem = prepare(FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]]), 1 - 1e-6)
+
+    def patience(progress: sweeping._Progress) -> int:
+        progress.stalls(1.0)
+        return next(n for n in range(2, 10**6) if progress.stalls(1.0))
+
+    assert patience(sweeping._Progress(problem, span=True)) == 22  # the first is a low; 20 may be none; then one more
+    assert patience(sweeping._Progress(problem, span=False)) == 100_002
+    constant, v = sweeping._Constant(problem, 1e-300), np.zeros(2)
+    assert not any(constant.settles(v, 1.0, 1.0 + 2**-20, last=False) for _ in range(21))
+    assert not constant.settles(v, 1.0, 1.0 + 2**-20, last=False)  # it stalls: the constant is taken out
+    assert v[0] > 1e5 and constant._progress._patience == 20
 
 
 def test_an_evaluation_by_sweeps_looks_at_its_policy_again_after_two_hundred() -> None:

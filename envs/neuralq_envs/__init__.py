@@ -55,6 +55,10 @@ ENVIRONMENTS = {
 WITHOUT_MODEL = {
     "neuralq/Backgammon-v0": Registration("neuralq_envs.backgammon.single_agent", has_vector=False),
     "neuralq/Checkers-v0": Registration("neuralq_envs.checkers.single_agent", has_vector=False),
+    "neuralq/LinearQuadratic-v0": Registration(
+        "neuralq_envs.linear_quadratic", has_vector=False, max_episode_steps=100
+    ),
+    "neuralq/Elevators-v0": Registration("neuralq_envs.elevators.environment", has_vector=False),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
 }

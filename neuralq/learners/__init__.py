@@ -10,10 +10,14 @@ Prediction is control with one action. True online TD(λ) is `PredictionLearner`
 linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
 a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
 
+`smdp_network_update` learns from actions that last, in compiled loops, for `neuralq.systems`.
+
 `TabularLearner` runs the compiled loops of `neuralq.tabular`: every algorithm of the chapter on a table.
 
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
+
+`fit_slopes` fits a small network to values and slopes at once, for whoever has a model that explains what was seen.
 
 A learner that runs can be made of ends with its `LearnerKind`; `learner_kinds` finds it, and nothing else lists it.
 """
@@ -31,6 +35,13 @@ from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
+from neuralq.learners.semi_markov import (
+    SmdpNetwork,
+    new_smdp_network,
+    smdp_network_update,
+    smdp_network_values,
+)
+from neuralq.learners.slopes import SlopeNet, fit_slopes, new_slope_net
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.learners.tabular.settings import TabularSettings
 from neuralq.learners.traces.learner import OnlineLearner, OnlineSettings, PredictionLearner
@@ -60,6 +71,8 @@ __all__ = [
     "ResidualGradientSettings",
     "RolloutLearner",
     "RolloutSettings",
+    "SlopeNet",
+    "SmdpNetwork",
     "StreamingLearner",
     "StreamingSettings",
     "TabularLearner",
@@ -68,5 +81,10 @@ __all__ = [
     "Traits",
     "TwinHead",
     "Update",
+    "fit_slopes",
     "learner_kinds",
+    "new_slope_net",
+    "new_smdp_network",
+    "smdp_network_update",
+    "smdp_network_values",
 ]

@@ -28,6 +28,8 @@ from neuralq.rules.returns import (
     watkins_lambda,
 )
 from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
+from neuralq.rules.semi_markov import smdp_discount
+from neuralq.rules.slopes import input_slopes, lob_star, return_slopes, squared_slopes
 from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule, target_rules
 from neuralq.rules.targets import (
     double_q,
@@ -64,9 +66,11 @@ __all__ = [
     "greedy",
     "greedy_random_ties",
     "huber",
+    "input_slopes",
     "is_greedy",
     "k_to_the_q",
     "lambda_returns",
+    "lob_star",
     "munchausen",
     "munchausen_bonus",
     "n_step_returns",
@@ -78,12 +82,15 @@ __all__ = [
     "replace",
     "residual_gradient_error",
     "retrace_coefficients",
+    "return_slopes",
     "sample",
     "sarsa",
     "semi_gradient_error",
+    "smdp_discount",
     "soft_value",
     "softmax",
     "squared",
+    "squared_slopes",
     "target_rules",
     "tree_backup_coefficients",
     "true_online_increment",

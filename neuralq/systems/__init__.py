@@ -33,6 +33,8 @@ class SystemEntry(NamedTuple):
 SYSTEMS = {
     "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic"),
     "checkers": SystemEntry("neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote"),
+    "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen"),
+    "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
 }
 

@@ -19,6 +19,7 @@ from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
 from neuralq.tabular.kernels.ase_ace import AseAce, AseAceRates, ase_ace_action, ase_ace_update, new_ase_ace
 from neuralq.tabular.kernels.backups import BackupRule, backup_update
 from neuralq.tabular.kernels.random_numbers import new_stream
+from neuralq.tabular.kernels.semi_markov import smdp_q_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
@@ -85,6 +86,7 @@ __all__ = [
     "robbins_monro_sums",
     "sarsa",
     "sarsa_lambda",
+    "smdp_q_update",
     "sweep_errors",
     "td_lambda",
     "under_policy",
