@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -14,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch import nn
 
+from neuralq.doctor.estimates import td_against_monte_carlo
 from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, signs, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.findings import Finding
@@ -238,6 +241,30 @@ def test_a_broken_contract_is_said_in_words() -> None:
     assert not environment.contract(ending(lambda t: t)).flagged
 
 
+def test_the_checker_of_stable_baselines_is_asked_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def check_env(env: Any, warn: bool, skip_render_check: bool) -> None:
+        asked.append(env)
+        assert not isinstance(env, Turning), "turning is forbidden"
+
+    name = "stable_baselines3.common.env_checker"
+    for part in ("stable_baselines3", "stable_baselines3.common", name):
+        monkeypatch.setitem(sys.modules, part, types.SimpleNamespace(check_env=check_env))  # type: ignore[arg-type]
+    found = environment.contract(case_of(lambda: Turning(2), both(np.abs)))
+    assert found.flagged and found.evidence == "Stable-Baselines3's check_env says: turning is forbidden"
+    assert not environment.contract(ending(lambda t: t)).flagged and len(asked) == 2
+    monkeypatch.setitem(sys.modules, name, None)  # type: ignore[arg-type]  # as if it were not installed
+    assert not environment.contract(case_of(lambda: Turning(2), both(np.abs))).flagged
+
+
+@pytest.mark.slow
+def test_the_real_checker_of_stable_baselines_finds_nothing_in_a_sound_environment() -> None:
+    pytest.importorskip("stable_baselines3")
+    found = environment.contract(case_of("CartPole-v1", lambda s: np.zeros((len(s), 2))))
+    assert not found.flagged and "Stable-Baselines3" in found.evidence
+
+
 def test_a_seed_that_decides_nothing_is_found() -> None:
     unseeded = np.random.default_rng()
     found = environment.determinism(case_of(lambda: Counting(shows=lambda t, rng: [unseeded.random()]), both(np.abs)))
@@ -295,7 +322,17 @@ def test_what_is_hidden_is_what_the_past_tells_more() -> None:
     hides = aliasing.aliasing(case_of(lambda: Turning(1), both(np.abs)))
     shows = aliasing.aliasing(case_of(lambda: Turning(2), both(np.abs)))
     assert hides.value == pytest.approx((1 + math.cos(ANGLE)) / 2, abs=0.05) and hides.flagged
-    assert abs(shows.value) < 0.02 and not shows.flagged
+    assert abs(shows.value) < 0.02 and not shows.flagged and "TD(0) and Monte Carlo differ by" in shows.evidence
+
+
+def test_temporal_differences_and_monte_carlo_disagree_where_states_look_alike() -> None:
+    """Two steps that pay 0 and 1, seen as one: returns γ and 1 average .95; V = .5 + γ V / 2 says .5 / .55."""
+    x, r, ended = np.zeros((40, 1)), np.tile([0.0, 1.0], 20), np.tile([False, True], 20)
+    g = np.tile([0.9, 1.0], 20)
+    alike = td_against_monte_carlo(x, r, x, ended, g, 0.9, np.random.default_rng(0))
+    assert alike == pytest.approx((0.95 - 0.5 / 0.55) / 0.05, rel=1e-3)
+    told = np.tile([[0.0], [1.0]], (20, 1))
+    assert td_against_monte_carlo(told, r, 1 - told, ended, g, 0.9, np.random.default_rng(0)) < 1e-3
 
 
 # R1–R6: networks with a known share of dead units, of known rank, fresh or moved.
@@ -406,6 +443,94 @@ def test_a_network_that_is_too_small_is_told_from_one_that_is_not(monkeypatch: p
     narrow, wide = (capacity.capacity(case_of(waving, two_layers(units))) for units in (1, 64))
     assert narrow.flagged and narrow.cause == "representation" and narrow.grade == "B"
     assert not wide.flagged and wide.value < 0.1
+
+
+# Action masks: what is illegal is never tried, and what is said of it counts nowhere.
+
+
+class Strict(Counting):
+    """Of three actions one is legal, t mod 3 (of the first two also the next); the others raise."""
+
+    def __init__(self, legal: Callable[[int], list[int]] = lambda t: [t % 3], **settings: Any) -> None:
+        super().__init__(**settings)
+        self.allows, self.action_space = legal, spaces.Discrete(3)
+
+    def _info(self) -> dict[str, Any]:
+        return {"action_mask": np.isin(np.arange(3), self.allows(self.t)).astype(np.int8)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        return super().reset(seed=seed)[0], self._info()
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        assert int(action) in self.allows(self.t), "an illegal action"
+        return *super().step(action)[:4], self._info()
+
+
+def tempting(value: Callable[[Array], Array]) -> Values:
+    """The same value for the legal action t mod 3, and a million for the others."""
+    return lambda s: np.where(np.arange(3) == s[:, :1] % 3, value(s[:, 0])[:, None], 1e6)
+
+
+def test_only_legal_actions_are_played_and_only_their_values_count() -> None:
+    case = case_of(lambda: Strict(pays=waves), tempting(lambda t: summed(t, lambda i: waves(i, 0))))
+    assert len(case.greedy) == 30 and all(one.length == ENDS for one in case.episodes)
+    assert values.bias(case).value == pytest.approx(0, abs=1e-9) and not values.soft_divergence(case).flagged
+    assert values.soft_divergence(case).value < 1
+    assert hypotheses.one_step(case).value == pytest.approx(GAMMA, abs=1e-6)
+    assert not environment.contract(case).flagged and not environment.determinism(case).flagged
+    assert values.better_actions(case).value == 0
+    assert {int(a) for one in case.constant[0] for a in one.actions} == {0, 1, 2}  # the others where it is illegal
+    pays = lambda t, a: float(a == (t + 1) % 3)  # noqa: E731
+    second = lambda s: np.where(np.arange(3) == (s[:, :1] + 1) % 3, 0.0, tempting(np.ones_like)(s))  # noqa: E731
+    wrong = values.better_actions(case_of(lambda: Strict(lambda t: [t % 3, (t + 1) % 3], pays=pays), second))
+    assert wrong.value == 1 and wrong.flagged  # the first is chosen, the second pays, the third counts for nothing
+
+
+def test_a_step_changes_no_policy_where_there_is_no_choice() -> None:
+    net = nn.Linear(2, 3)
+    shows = lambda t, rng: [rng.normal(), rng.normal()]  # noqa: E731
+    known = Settings(learning_rate=1.0)
+    masked, free = (
+        case_of(lambda allows=allows: Strict(allows, shows=shows, pays=lambda t, a: t % 2), net, settings=known)  # type: ignore[misc]
+        for allows in (lambda t: [t % 3], lambda t: [0, 1, 2])
+    )
+    assert network.churn(masked).value == 0 < network.churn(free).value
+    assert math.isfinite(network.kernel(masked).value)
+
+
+class Walled(gym.Wrapper[Any, Any, Any, Any]):
+    """FrozenLake whose masks forbid what bumps into a wall."""
+
+    def _info(self) -> dict[str, Any]:
+        row, column = divmod(int(self.env.unwrapped.s), 4)  # type: ignore[attr-defined]
+        return {"action_mask": np.array([column > 0, row < 3, column < 3, row > 0])}
+
+    def reset(self, **given: Any) -> Any:
+        return self.env.reset(**given)[0], self._info()
+
+    def step(self, action: Any) -> Any:
+        return *self.env.step(action)[:4], self._info()
+
+
+def test_exact_regret_knows_the_masks_that_were_met() -> None:
+    lake = gym.make("FrozenLake-v1", is_slippery=False)
+    q = np.nan_to_num(solve(FiniteMDP.from_gymnasium(lake), GAMMA).q)
+    at = np.arange(16)
+    q = np.where(np.stack([at % 4 > 0, at < 12, at % 4 < 3, at > 3], axis=1), q, 1e3)
+    case = case_of(lambda: Walled(gym.make("FrozenLake-v1", is_slippery=False)), lambda s: q[s])
+    assert exactly.regret(case).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(case).value == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_exact_regret_asks_the_masks_of_an_environment_whose_model_has_none() -> None:
+    taxi = gym.make("Taxi-v4").unwrapped
+    legal = np.stack([taxi.action_mask(s) for s in range(500)]) != 0  # type: ignore[attr-defined]
+    q = np.where(legal, solve(FiniteMDP.from_gymnasium(taxi), GAMMA).q, 1e3)
+    case = case_of("Taxi-v4", lambda s: q[s])
+    assert exactly.regret(case).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(case).value == pytest.approx(0, abs=1e-9)
+    assert not values.has_learned(case).flagged
 
 
 # D1–D5: stored experience.

@@ -345,3 +345,10 @@ def test_every_class_of_a_chain_has_to_settle(
     M, each, half = np.array([[[first]], [[second]]]), np.arange(2), np.full(2, 0.5)
     maps = UpdateMaps(M, np.zeros((2, 1)), each, each, np.ones(2), half, half)
     assert second_moment_stable(maps, "markov") == (max(first, second) < 1)
+
+
+def test_a_step_to_the_first_row_is_no_end() -> None:
+    # The first row leads to itself and doubles θ; what ends begins again in the second, which never comes back.
+    rows, D, start = np.array([0, 1]), np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    maps = UpdateMaps(np.array([[[2.0]], [[0.5]]]), np.zeros((2, 1)), rows, rows, np.ones(2), D, start)
+    assert mean_radius(maps, "markov") == pytest.approx(2.0) and not second_moment_stable(maps, "markov")

@@ -35,6 +35,7 @@ _GAMMA = 0.99
 
 _MEASUREMENTS: dict[str, Measurement] = {
     "V1": values.has_learned,
+    "X5": seeds.luck,
     "V4": values.soft_divergence,
     "V5": values.reach,
     "V2": values.bias,
@@ -64,7 +65,6 @@ _MEASUREMENTS: dict[str, Measurement] = {
     "V6a": values.better_actions,
     "R7": capacity.capacity,
     "R5": network.plasticity,
-    "X5": seeds.luck,
 }
 NUM_PARTS = len(_MEASUREMENTS) + 2
 """Of an examination: the measurements, and twice episodes are played."""
@@ -262,7 +262,7 @@ def _drawn(case: Case) -> dict[str, Array]:
         if len(returns):
             q = one.values[np.arange(len(returns)), one.actions[: len(returns)]]
             pairs.append(np.column_stack([returns, q]))
-            starts.append([one.score, one.values[0].max(), returns[0]])
+            starts.append([one.score, one.legal_values[0].max(), returns[0]])
     if not pairs:
         return {}
     points = np.concatenate(pairs)
