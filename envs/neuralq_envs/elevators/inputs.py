@@ -1,4 +1,4 @@
-"""What a car sees when it decides: 5F − 3 numbers, which say how old calls are, where it is and where the others are."""
+"""What a car sees when it decides: 5F − 3 numbers, of how old calls are, where it is and where the others are."""
 
 from __future__ import annotations
 
