@@ -10,7 +10,7 @@ Prediction is control with one action. True online TD(λ) is `PredictionLearner`
 linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
 a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
 
-`smdp_network_update` learns from actions that last, in compiled loops, for `neuralq.systems`.
+`smdp_network_update` learns from actions that last, one decision at a time, from Python and from compiled loops.
 
 `TabularLearner` runs the compiled loops of `neuralq.tabular`: every algorithm of the chapter on a table.
 
