@@ -65,20 +65,26 @@ def gantt_picture(problem: JobShop, repaired: Repaired) -> Picture:
 
 
 def _bars(axes: Axes, problem: JobShop, frame: Frame) -> None:
-    shop = problem.arrays
-    missions = _components(problem)
-    axes.barh(
-        range(problem.num_tasks), shop.durations, left=frame.start, height=0.8,
-        color=[COLOURS[mission % len(COLOURS)] for mission in missions],
-    )  # fmt: skip
-    axes.invert_yaxis()
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    durations, missions = problem.arrays.durations, np.array(_components(problem))
+    for mission in range(missions.max() + 1):  # one outline each: as many rectangles would be three times as long
+        corners = [
+            np.array([[x, i - 0.4], [x + width, i - 0.4], [x + width, i + 0.4], [x, i + 0.4], [x, i - 0.4]])
+            for i, (x, width) in enumerate(zip(frame.start.tolist(), durations.tolist(), strict=True))
+            if missions[i] == mission
+        ]
+        outline = Path.make_compound_path(*(Path(one, closed=True) for one in corners))
+        axes.add_patch(PathPatch(outline, facecolor=COLOURS[mission % len(COLOURS)], linewidth=0))
+    axes.set_ylim(problem.num_tasks - 0.4, -0.6)
     axes.set_yticks([])
     axes.grid(visible=False, axis="y")
 
 
 def _band(axes: Axes, usage: np.ndarray[tuple[int, ...], np.dtype[np.int64]], capacity: int) -> None:
-    t = np.arange(len(usage) + 1)
-    taken = np.append(usage, usage[-1])
+    t = np.append(np.flatnonzero(np.diff(usage, prepend=-1)), len(usage))  # where it changes, and the end
+    taken = np.append(usage, usage[-1])[t]
     axes.fill_between(t, np.minimum(taken, capacity), step="post", color=COLOURS[4], linewidth=0)
     axes.fill_between(t, capacity, np.maximum(taken, capacity), step="post", color=COLOURS[1], linewidth=0)
     axes.axhline(capacity, color="#555555", linewidth=1)
