@@ -231,6 +231,18 @@ def test_right_values_are_no_mistake_and_two_that_agree_are_not_told_apart() -> 
     assert not flat.flagged and "cannot tell" in flat.evidence
 
 
+def test_a_mistake_has_to_fit_clearly_better_and_lines_are_drawn_in_the_order_of_returns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = MISTAKES["no end of episodes in the target"]()
+    found = hypotheses.lines(case)
+    assert next(iter(found)) == "no end of episodes in the target" and len(found) == 2
+    line = found["no end of episodes in the target"]
+    assert (np.diff(line[:, 0]) > 0).all() and line[:, 1] == pytest.approx(np.full(20, 10.0))
+    monkeypatch.setattr(hypotheses, "_BETTER", 0.0)
+    assert not hypotheses.hypotheses(case).flagged
+
+
 def test_too_few_copies_are_not_taken_for_a_mistake() -> None:
     known = Settings(updates=10, target_period_updates=10)
     case = case_of(lambda: Counting(), both(lambda t: worth(ENDS - t, 0.5)), settings=known)
@@ -591,6 +603,25 @@ def test_a_buffer_that_holds_too_little_is_named_with_and_without_the_data() -> 
         case_of(lambda: Counting(), both(lambda t: t), settings=Settings(capacity=n)) for n in (60.0, 6000.0)
     )
     assert stored.window(small).flagged and not stored.window(large).flagged
+
+
+def test_stored_actions_are_those_that_the_environment_names() -> None:
+    """Numbered from 3, and worth t and t + 100: read from another number they would be each other's, or none."""
+
+    class Shifted(gym.ActionWrapper[Any, Any, Any]):
+        def __init__(self) -> None:
+            super().__init__(Counting(ends=None, cuts=50))
+            self.action_space = spaces.Discrete(2, start=3)
+
+        def action(self, action: Any) -> int:
+            return int(action) - 3
+
+    rows = {**experience(), "reward": np.ones(600), "action": experience()["action"] + 3}
+    case = case_of(Shifted, lambda s: np.stack([s[:, 0], 100 + s[:, 0]], axis=1), data=rows)
+    s, a = rows["obs"][:, 0], rows["action"] - 3
+    errors = 1 + GAMMA * (101 + s) - (s + 100 * a)
+    got = values._td_error(case, *(case.stored[k] for k in ("obs", "action", "reward", "next_obs", "terminated")))  # type: ignore[index]
+    assert got == pytest.approx((errors**2).mean())
 
 
 def test_a_missing_column_is_named_with_the_line_that_writes_it() -> None:
