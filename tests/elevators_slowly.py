@@ -63,11 +63,9 @@ class SlowBuilding:
             elif car.doing in ("opens", "loads"):
                 self._loads(car)
             elif car.aboard:
-                left_behind = len(car.aboard) == self.capacity and self.queues[car.floor]
-                floor = car.floor
                 self._moves(car, -1)
-                if left_behind:
-                    self._wakes(floor)
+                if self.queues[car.floor]:
+                    self._wakes(car.floor)
             else:
                 self._chooses(car)
 
@@ -78,7 +76,8 @@ class SlowBuilding:
             self._wakes(person.floor)
 
     def _wakes(self, floor: int) -> None:
-        parked = [car for car in self.cars if car.doing == "parked"]
+        stood = {car.floor for car in self.cars if car.stands}
+        parked = [c for c in self.cars if c.doing == "parked" and not (c.floor == floor and floor in stood)]
         if parked:
             car = min(parked, key=lambda c: (abs(c.floor - floor), c.number))
             if car.floor == floor:

@@ -185,6 +185,19 @@ def test_policies_are_counted_whether_factored_or_swept(monkeypatch: pytest.Monk
         assert (backups - evaluations * slow.rows) % 20 == 0 and backups - evaluations * slow.rows > 20 * 300
 
 
+def test_a_linear_program_counts_the_sweeps_that_evaluate_its_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = Slow(0, 0.9)
+    assert counts(solve(slow.mdp, 0.9, "linear-programming"), slow)[1] == 0  # factored
+    monkeypatch.setattr(policies, "_MOST_FACTORED", 19)
+    backups = counts(solve(slow.mdp, 0.9, "linear-programming"), slow)[1]
+    assert backups >= 20 and backups % 20 == 0
+
+
+def test_paths_are_looked_for_no_longer_than_is_said() -> None:
+    chain = FiniteMDP.from_arrays([np.eye(6, k=1)], [[-1.0]] * 5 + [[np.nan]])
+    assert [solve(chain, 1.0, "bellman-ford", max_iterations=n).iterations for n in (1, 2, 100)] == [1, 2, 6]
+
+
 def test_the_error_of_an_evaluation_by_sweeps_is_no_less_than_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     # A constant error of c changes by (1 − γ) c in a sweep, so one that is a little above what changes by the scale
     # of rounding is left as it is.

@@ -42,9 +42,9 @@ class ElevatorsEnv(gymnasium.Env[Any, Any]):
     **What the discount between steps is.** Steps last between nothing and minutes (``info["duration"]``, seconds).
     The reward is −∫ e^(−βt) 10⁻⁶ Σ w² dt over the step, w the waits of all who wait, and what follows would have to
     be discounted by ``info["discount"]`` = e^(−βτ), a different number each time. An ordinary learner has one γ
-    instead: 0.94 is e^(−βτ) of the mean duration, 6.5 s, where β is .01. Who learns with the true ones
-    (`neuralq.rules.smdp_discount`) solves the semi-Markov problem that `neuralq chapter elevators` is about, where each
-    car, too, is told what the time until its own next decision has cost.
+    instead: 0.94 is e^(−βτ) of the mean duration, 6.5 s, where β is .01. `neuralq chapter
+    elevators` learns with the true ones (`neuralq.rules.smdp_discount`), and there a step of a car lasts until the same
+    car decides again.
 
     Args:
         render_mode: None, ``"ansi"`` or ``"rgb_array"``.

@@ -153,11 +153,13 @@ def _choose(building: Building, car: int, now: float) -> None:
 
 @lean_kernel
 def _call(building: Building, floor: int, now: float) -> None:
-    """Wakes the nearest parked car, if there is one; of equally near ones the first."""
+    """Wakes the nearest parked car that could stop there, if there is one; of equally near ones the first."""
     b = building
     nearest = -1
     for c in range(len(b.floor)):
-        if b.phase[c] == PARKED and (nearest < 0 or abs(b.floor[c] - floor) < abs(b.floor[nearest] - floor)):
+        if b.phase[c] != PARKED or (b.floor[c] == floor and _another_stands(b, floor, c)):
+            continue
+        if nearest < 0 or abs(b.floor[c] - floor) < abs(b.floor[nearest] - floor):
             nearest = c
     if nearest < 0:
         return
@@ -229,7 +231,7 @@ def _depart(building: Building, car: int, now: float) -> None:
         return
     floor = b.floor[car]
     _go(b, car, -1, now)
-    if b.aboard[car] == b.counts[CAPACITY] and b.waiting[floor] > 0:
+    if b.waiting[floor] > 0:
         _call(b, floor, now)  # whoever was left behind presses the button again
 
 
