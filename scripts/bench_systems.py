@@ -51,6 +51,12 @@ def fit_to_slopes(num_steps: int) -> None:
     fit_slopes(new_slope_net(2, 10, rng), s, rng.normal(size=20), slope, num_steps=num_steps)
 
 
+def obelix_behaviours(num_steps: int) -> None:
+    from neuralq.systems.obelix.lives import spend
+
+    spend(0, "behaviours", "table", num_steps=max(num_steps, 4))
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
@@ -80,6 +86,7 @@ WORK = {
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
     "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
     "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
+    "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }
 

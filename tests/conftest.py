@@ -82,6 +82,7 @@ SYSTEMS = (
     "test_backgammon_match",
     "test_backgammon_run",
     "test_checkers_learning",
+    "test_obelix",
 )
 
 
