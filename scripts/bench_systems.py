@@ -41,6 +41,14 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def elevators(num_hours: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.elevators.training import Settings, train
+
+    train(np.random.SeedSequence(0), Settings(num_hours))
+
+
 def fit_to_slopes(num_steps: int) -> None:
     import numpy as np
 
@@ -61,6 +69,13 @@ def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
     train(0, Settings(0.5, long_trial_steps=10_000, most_failures=num_trials))
+
+
+def job_shop(num_episodes: int) -> None:
+    from neuralq.systems.job_shop.system import problems_of
+    from neuralq.systems.job_shop.trials import Settings, train
+
+    train(0, problems_of(100, 0), problems_of(50, 1) if num_episodes > 50 else (), Settings(num_episodes))
 
 
 def checkers_learning(num_games: int) -> None:
@@ -86,6 +101,8 @@ WORK = {
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
     "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
     "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
+    "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
+    "job-shop": Work("6,000 episodes of repair, 51 tasks", job_shop, 6000, 20, most_seconds=5.0),
     "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }

@@ -82,14 +82,17 @@ SYSTEMS = (
     "test_backgammon_match",
     "test_backgammon_run",
     "test_checkers_learning",
+    "test_elevators",
+    "test_job_shop",
     "test_obelix",
 )
+FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
     for item in items:
-        of_system = item.path.stem in SYSTEMS or ROOT / "neuralq" / "systems" in item.path.parents
+        of_system = item.path.stem in SYSTEMS or not FOLDERS.isdisjoint(item.path.parents)
         if of_system and item.get_closest_marker("slow") is None:
             item.add_marker("slow")
             item.add_marker("systems")

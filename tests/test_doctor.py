@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ from neuralq.apps.cli import main
 from neuralq.doctor import CannotLoad, Finding, Report, examination, examine
 from neuralq.doctor.examination import NUM_PARTS
 from neuralq.doctor.findings import CAUSES
+from neuralq.learners import RolloutSettings
+from neuralq.runs import RunConfig, train
+from neuralq.runs.folder.files import read_json, to_json
+from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.sweep import create_sweep
 
 GAMMA = 0.9
 FROZEN = {"env": "FrozenLake-v1", "env_kwargs": {"is_slippery": False}}
@@ -44,10 +50,10 @@ def few_episodes() -> Iterator[None]:
 
 
 @pytest.fixture
-def without_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the measurements that train networks, which take more time than all others."""
-    for name in ("R5", "R7"):
-        monkeypatch.delitem(examination._MEASUREMENTS, name)
+def few_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked of commands does not depend on which are made; those that train or copy take the most time."""
+    kept = {"V1", "X5", "V4", "V2", "V3", "E5", "R6a", "R1", "R2", "R4", "D4"}
+    monkeypatch.setattr(examination, "_MEASUREMENTS", {n: m for n, m in examination._MEASUREMENTS.items() if n in kept})
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +101,11 @@ def test_the_page_is_one_file_and_says_what_was_found(sick: Report, tmp_path: Pa
     assert sick.headline in text and "What was not measured, and why" in text and "prefers-color-scheme: dark" in text
     assert "<script" not in text and "http://" not in text.replace("http://www.w3.org/2000/svg", "")
     assert text.count("<svg") == 2 and all(one.title in text for one in sick.findings if one.grade in "AB")
+    fresh = (0.1, 0.2, 0.2, 0.3, 0.1, 0.2, 0.2, 0.3)
+    signs = [Finding("R2", "", "algorithm", "C", x, threshold=3.0, fresh=fresh) for x in (0.2, 4.0)]
+    signs += [Finding("R4", "", "algorithm", "C", 0.0, threshold=0.1, fresh=(0.0,) * 8)]
+    text = dataclasses.replace(sick, measured=tuple(signs)).write(tmp_path / "signs.html").read_text(encoding="utf-8")
+    assert text.count("<svg") == 3 and "R2, effective rank of the last hidden layer (directions): 4, fresh" in text
 
 
 @pytest.mark.slow
@@ -158,19 +169,22 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("without_training")
+@pytest.mark.usefixtures("few_measurements")
 def test_the_command_prints_json_last_writes_the_page_and_exits_by_its_findings(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = tmp_path / "report.html"
+    monkeypatch.setattr("neuralq.doctor.page.draw_svg", lambda name, *told: f"<svg id={name}>")
     command = ["doctor", str(weights), "--env", "CartPole-v1", "--set", "lr=1e-3", "--json"]
     assert main([*command, "--report", str(page)]) == 1
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert said["healthy"] is False and said["report"] == str(page) and page.is_file()
-    assert {"R1", "R2", "R6a"} <= {one["id"] for one in said["measured"]}
+    assert said["healthy"] is False and said["report"] == str(page)
+    beside = {one["id"]: one["fresh"] for one in said["measured"] if one["fresh"]}
+    assert set(beside) == {"R1", "R2", "R4", "R6a"} and {len(of_eight) for of_eight in beside.values()} == {8}
+    assert "<svg id=signs>" in (text := page.read_text(encoding="utf-8")) and "of fresh networks" in text
 
 
-@pytest.mark.usefixtures("without_training")
+@pytest.mark.usefixtures("few_measurements")
 def test_the_command_exits_with_2_where_nothing_can_be_loaded(
     weights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -182,7 +196,7 @@ def test_the_command_exits_with_2_where_nothing_can_be_loaded(
     assert "Traceback" not in error
 
 
-@pytest.mark.usefixtures("without_training")
+@pytest.mark.usefixtures("few_measurements")
 def test_the_command_exits_with_0_where_all_is_well(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,7 +227,32 @@ def test_the_command_exits_with_0_where_all_is_well(
     assert status == 0 and "Healthy" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("without_training")
+@pytest.mark.usefixtures("few_measurements")
+def test_of_a_sweep_the_worst_seed_is_examined_and_what_the_others_return_says_whether_it_was_luck(
+    tmp_path: Path,
+) -> None:
+    """Two seeds that learned next to nothing; of one of them its summary says otherwise, or the same."""
+    config = RunConfig(
+        total_steps=64, evaluation_episodes=1, epsilon_decay_steps=64, rollout=RolloutSettings(num_envs=2, num_steps=16)
+    )  # fmt: skip
+    sweep = create_sweep(tmp_path / "sweep", config_to_dict(config), (0, 1))
+    with pytest.raises(CannotLoad, match=f"neuralq resume {sweep.path}"):
+        examine(str(sweep.path))
+    for seed in sweep.seeds:
+        train(dataclasses.replace(config, seed=seed), sweep.run_path(seed))
+    for best in (500.0, 9.5):
+        for seed in sweep.seeds:
+            path = sweep.run_path(seed) / "summary.json"
+            told = {**read_json(path), "greedy_return": best if seed == 0 else 9.0, "play_off": None}
+            path.write_text(to_json(told, "summary", sealed=True))
+        report = examine(sweep.path, budget_s=20)
+        luck = next(one for one in report.measured if one.id == "X5")
+        assert report.subject.startswith("seed 1, the worst of 2") and luck.value == (0.5 if best == 500 else 0)
+        assert luck.flagged == (best == 500) == (report.cause == "luck") == ("X5" in report.headline)
+        assert best != 500 or "neuralq train CartPole-v1 --seeds 5" in luck.confirm
+
+
+@pytest.mark.usefixtures("few_measurements")
 def test_a_run_that_misses_its_target_ends_with_three_findings_and_one_that_asks_with_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

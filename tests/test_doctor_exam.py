@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -14,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch import nn
 
+from neuralq.doctor.estimates import td_against_monte_carlo
 from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, signs, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.findings import Finding
@@ -29,10 +32,13 @@ from neuralq.types import Array
 
 @pytest.fixture(autouse=True, scope="module")
 def few_episodes() -> Iterator[None]:
-    """What is measured here is known exactly or nearly; a third of the episodes say it as well."""
+    """What is measured here is known exactly or nearly; a fifth of the episodes say it as well."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, number in (("NUM_GREEDY", 30), ("NUM_EXPLORED", 12), ("NUM_OTHER", 12)):
+        for name, number in (("NUM_GREEDY", 20), ("NUM_EXPLORED", 9), ("NUM_OTHER", 9)):
             patch.setattr(f"neuralq.doctor.exam.case.{name}", number)
+        patch.setattr(values, "_NUM_STATES", 10)
+        patch.setattr(network, "_FEW_WEIGHTS", 0)  # no kernels of fresh networks
+        patch.setattr(aliasing, "_MOST_ROWS", 2000)
         yield
 
 
@@ -157,6 +163,16 @@ def test_a_policy_that_is_no_better_than_one_action_has_not_learned() -> None:
     assert values.better_actions(wrong).value == 1 and values.better_actions(wrong).flagged
 
 
+def test_values_that_order_states_as_their_returns_do_are_told_from_those_that_do_not() -> None:
+    right, reversed_, none = (
+        values.rank(ending(value)) for value in (lambda t: worth(ENDS - t), lambda t: t, lambda t: np.zeros(len(t)))
+    )
+    assert right.value == 1 and not right.flagged  # though a third of them were enough
+    assert reversed_.value == -1 and reversed_.flagged and none.value == 0 and none.flagged
+    with pytest.raises(CannotMeasure, match="hardly differ"):
+        values.rank(limited(lambda t: t))  # of which every state is worth the same
+
+
 # V5: reach.
 
 
@@ -215,6 +231,18 @@ def test_right_values_are_no_mistake_and_two_that_agree_are_not_told_apart() -> 
     assert not flat.flagged and "cannot tell" in flat.evidence
 
 
+def test_a_mistake_has_to_fit_clearly_better_and_lines_are_drawn_in_the_order_of_returns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = MISTAKES["no end of episodes in the target"]()
+    found = hypotheses.lines(case)
+    assert next(iter(found)) == "no end of episodes in the target" and len(found) == 2
+    line = found["no end of episodes in the target"]
+    assert (np.diff(line[:, 0]) > 0).all() and line[:, 1] == pytest.approx(np.full(20, 10.0))
+    monkeypatch.setattr(hypotheses, "_BETTER", 0.0)
+    assert not hypotheses.hypotheses(case).flagged
+
+
 def test_too_few_copies_are_not_taken_for_a_mistake() -> None:
     known = Settings(updates=10, target_period_updates=10)
     case = case_of(lambda: Counting(), both(lambda t: worth(ENDS - t, 0.5)), settings=known)
@@ -236,6 +264,30 @@ def test_a_broken_contract_is_said_in_words() -> None:
     found = environment.contract(case_of(lambda: broken, both(lambda t: t)))
     assert found.flagged and "NaN" in found.evidence
     assert not environment.contract(ending(lambda t: t)).flagged
+
+
+def test_the_checker_of_stable_baselines_is_asked_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def check_env(env: Any, warn: bool, skip_render_check: bool) -> None:
+        asked.append(env)
+        assert not isinstance(env, Turning), "turning is forbidden"
+
+    name = "stable_baselines3.common.env_checker"
+    for part in ("stable_baselines3", "stable_baselines3.common", name):
+        monkeypatch.setitem(sys.modules, part, types.SimpleNamespace(check_env=check_env))  # type: ignore[arg-type]
+    found = environment.contract(case_of(lambda: Turning(2), both(np.abs)))
+    assert found.flagged and found.evidence == "Stable-Baselines3's check_env says: turning is forbidden"
+    assert not environment.contract(ending(lambda t: t)).flagged and len(asked) == 2
+    monkeypatch.setitem(sys.modules, name, None)  # type: ignore[arg-type]  # as if it were not installed
+    assert not environment.contract(case_of(lambda: Turning(2), both(np.abs))).flagged
+
+
+@pytest.mark.slow
+def test_the_real_checker_of_stable_baselines_finds_nothing_in_a_sound_environment() -> None:
+    pytest.importorskip("stable_baselines3")
+    found = environment.contract(case_of("CartPole-v1", lambda s: np.zeros((len(s), 2))))
+    assert not found.flagged and "Stable-Baselines3" in found.evidence
 
 
 def test_a_seed_that_decides_nothing_is_found() -> None:
@@ -295,7 +347,17 @@ def test_what_is_hidden_is_what_the_past_tells_more() -> None:
     hides = aliasing.aliasing(case_of(lambda: Turning(1), both(np.abs)))
     shows = aliasing.aliasing(case_of(lambda: Turning(2), both(np.abs)))
     assert hides.value == pytest.approx((1 + math.cos(ANGLE)) / 2, abs=0.05) and hides.flagged
-    assert abs(shows.value) < 0.02 and not shows.flagged
+    assert abs(shows.value) < 0.02 and not shows.flagged and "TD(0) and Monte Carlo differ by" in shows.evidence
+
+
+def test_temporal_differences_and_monte_carlo_disagree_where_states_look_alike() -> None:
+    """Two steps that pay 0 and 1, seen as one: returns γ and 1 average .95; V = .5 + γ V / 2 says .5 / .55."""
+    x, r, ended = np.zeros((40, 1)), np.tile([0.0, 1.0], 20), np.tile([False, True], 20)
+    g = np.tile([0.9, 1.0], 20)
+    alike = td_against_monte_carlo(x, r, x, ended, g, 0.9, np.random.default_rng(0))
+    assert alike == pytest.approx((0.95 - 0.5 / 0.55) / 0.05, rel=1e-3)
+    told = np.tile([[0.0], [1.0]], (20, 1))
+    assert td_against_monte_carlo(told, r, 1 - told, ended, g, 0.9, np.random.default_rng(0)) < 1e-3
 
 
 # R1–R6: networks with a known share of dead units, of known rank, fresh or moved.
@@ -320,6 +382,9 @@ def test_dormant_units_are_counted_and_fresh_networks_are_not_flagged() -> None:
         net[0].bias[40:] = 1.0  # type: ignore[index]
     dead = network.dormant(case_of(noisy, net))
     assert dead.flagged and "80 % of hidden units" in dead.evidence
+    assert dead.fresh == healthy.fresh and sum(healthy.fresh) == pytest.approx(0, abs=1e-9)  # about their mean
+    assert max(dead.fresh) < 0.2 < dead.value and healthy.interval is not None
+    assert healthy.interval[0] == pytest.approx(healthy.value - max(healthy.fresh))
 
 
 def test_effective_rank_of_units_that_all_say_the_same_is_one() -> None:
@@ -329,7 +394,7 @@ def test_effective_rank_of_units_that_all_say_the_same_is_one() -> None:
         net[0].weight[:] = net[0].weight[0]  # type: ignore[index]
         net[0].bias[:] = net[0].bias[0]  # type: ignore[index]
     same = network.effective_rank(case_of(noisy, net))
-    assert same.value == 1 and same.flagged
+    assert same.value == 1 and same.flagged and (min(same.fresh), max(same.fresh)) == same.interval
 
 
 def test_weights_that_never_moved_are_known() -> None:
@@ -339,6 +404,7 @@ def test_weights_that_never_moved_are_known() -> None:
         net[2].weight *= 3  # a third of them stays where all were
     moved = network.untouched(case_of(noisy, net))
     assert not moved.flagged and moved.value > 2
+    assert moved.threshold == 1.5 * max(moved.fresh) and len(moved.fresh) == 8
 
 
 def test_lag_is_relative_and_weights_that_are_not_finite_are_named() -> None:
@@ -394,7 +460,8 @@ def test_plasticity_of_a_fresh_network_is_that_of_a_fresh_network() -> None:
 
 def test_a_network_that_is_too_small_is_told_from_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """Returns rise, fall and rise again along an episode, and one unit bends a line once."""
-    monkeypatch.setattr(capacity, "_NUM_STEPS", 100)
+    for name, number in (("_NUM_STEPS", 60), ("_SEEDS", 4)):
+        monkeypatch.setattr(capacity, name, number)
 
     def waving() -> gym.Env[Any, Any]:
         return Counting(pays=lambda t, a: 3 * math.cos(t / 3), shows=lambda t, rng: [t / 15 - 1, 0.0])
@@ -402,6 +469,94 @@ def test_a_network_that_is_too_small_is_told_from_one_that_is_not(monkeypatch: p
     narrow, wide = (capacity.capacity(case_of(waving, two_layers(units))) for units in (1, 64))
     assert narrow.flagged and narrow.cause == "representation" and narrow.grade == "B"
     assert not wide.flagged and wide.value < 0.1
+
+
+# Action masks: what is illegal is never tried, and what is said of it counts nowhere.
+
+
+class Strict(Counting):
+    """Of three actions one is legal, t mod 3 (of the first two also the next); the others raise."""
+
+    def __init__(self, legal: Callable[[int], list[int]] = lambda t: [t % 3], **settings: Any) -> None:
+        super().__init__(**settings)
+        self.allows, self.action_space = legal, spaces.Discrete(3)
+
+    def _info(self) -> dict[str, Any]:
+        return {"action_mask": np.isin(np.arange(3), self.allows(self.t)).astype(np.int8)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        return super().reset(seed=seed)[0], self._info()
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        assert int(action) in self.allows(self.t), "an illegal action"
+        return *super().step(action)[:4], self._info()
+
+
+def tempting(value: Callable[[Array], Array]) -> Values:
+    """The same value for the legal action t mod 3, and a million for the others."""
+    return lambda s: np.where(np.arange(3) == s[:, :1] % 3, value(s[:, 0])[:, None], 1e6)
+
+
+def test_only_legal_actions_are_played_and_only_their_values_count() -> None:
+    case = case_of(lambda: Strict(pays=waves), tempting(lambda t: summed(t, lambda i: waves(i, 0))))
+    assert len(case.greedy) == 20 and all(one.length == ENDS for one in case.episodes)
+    assert values.bias(case).value == pytest.approx(0, abs=1e-9) and not values.soft_divergence(case).flagged
+    assert values.soft_divergence(case).value < 1
+    assert hypotheses.one_step(case).value == pytest.approx(GAMMA, abs=1e-6)
+    assert not environment.contract(case).flagged and not environment.determinism(case).flagged
+    assert values.better_actions(case).value == 0
+    assert {int(a) for one in case.constant[0] for a in one.actions} == {0, 1, 2}  # the others where it is illegal
+    pays = lambda t, a: float(a == (t + 1) % 3)  # noqa: E731
+    second = lambda s: np.where(np.arange(3) == (s[:, :1] + 1) % 3, 0.0, tempting(np.ones_like)(s))  # noqa: E731
+    wrong = values.better_actions(case_of(lambda: Strict(lambda t: [t % 3, (t + 1) % 3], pays=pays), second))
+    assert wrong.value == 1 and wrong.flagged  # the first is chosen, the second pays, the third counts for nothing
+
+
+def test_a_step_changes_no_policy_where_there_is_no_choice() -> None:
+    net = signs.fresh(nn.Linear(2, 3), np.random.default_rng(0))
+    shows = lambda t, rng: [rng.normal(), rng.normal()]  # noqa: E731
+    known = Settings(learning_rate=1.0)
+    masked, free = (
+        case_of(lambda allows=allows: Strict(allows, shows=shows, pays=lambda t, a: t % 2), net, settings=known)  # type: ignore[misc]
+        for allows in (lambda t: [t % 3], lambda t: [0, 1, 2])
+    )
+    assert {network.churn(masked).value, *network.churn(masked).fresh} == {0.0} and max(network.churn(free).fresh) > 0.2
+    assert math.isfinite(network.kernel(masked).value)
+
+
+class Walled(gym.Wrapper[Any, Any, Any, Any]):
+    """FrozenLake whose masks forbid what bumps into a wall."""
+
+    def _info(self) -> dict[str, Any]:
+        row, column = divmod(int(self.env.unwrapped.s), 4)  # type: ignore[attr-defined]
+        return {"action_mask": np.array([column > 0, row < 3, column < 3, row > 0])}
+
+    def reset(self, **given: Any) -> Any:
+        return self.env.reset(**given)[0], self._info()
+
+    def step(self, action: Any) -> Any:
+        return *self.env.step(action)[:4], self._info()
+
+
+def test_exact_regret_knows_the_masks_that_were_met() -> None:
+    lake = gym.make("FrozenLake-v1", is_slippery=False)
+    q = np.nan_to_num(solve(FiniteMDP.from_gymnasium(lake), GAMMA).q)
+    at = np.arange(16)
+    q = np.where(np.stack([at % 4 > 0, at < 12, at % 4 < 3, at > 3], axis=1), q, 1e3)
+    case = case_of(lambda: Walled(gym.make("FrozenLake-v1", is_slippery=False)), lambda s: q[s])
+    assert exactly.regret(case).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(case).value == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_exact_regret_asks_the_masks_of_an_environment_whose_model_has_none() -> None:
+    taxi = gym.make("Taxi-v4").unwrapped
+    legal = np.stack([taxi.action_mask(s) for s in range(500)]) != 0  # type: ignore[attr-defined]
+    q = np.where(legal, solve(FiniteMDP.from_gymnasium(taxi), GAMMA).q, 1e3)
+    case = case_of("Taxi-v4", lambda s: q[s])
+    assert exactly.regret(case).value == pytest.approx(0, abs=1e-9)
+    assert exactly.against_optimum(case).value == pytest.approx(0, abs=1e-9)
+    assert not values.has_learned(case).flagged
 
 
 # D1–D5: stored experience.
@@ -450,6 +605,25 @@ def test_a_buffer_that_holds_too_little_is_named_with_and_without_the_data() -> 
     assert stored.window(small).flagged and not stored.window(large).flagged
 
 
+def test_stored_actions_are_those_that_the_environment_names() -> None:
+    """Numbered from 3, and worth t and t + 100: read from another number they would be each other's, or none."""
+
+    class Shifted(gym.ActionWrapper[Any, Any, Any]):
+        def __init__(self) -> None:
+            super().__init__(Counting(ends=None, cuts=50))
+            self.action_space = spaces.Discrete(2, start=3)
+
+        def action(self, action: Any) -> int:
+            return int(action) - 3
+
+    rows = {**experience(), "reward": np.ones(600), "action": experience()["action"] + 3}
+    case = case_of(Shifted, lambda s: np.stack([s[:, 0], 100 + s[:, 0]], axis=1), data=rows)
+    s, a = rows["obs"][:, 0], rows["action"] - 3
+    errors = 1 + GAMMA * (101 + s) - (s + 100 * a)
+    got = values._td_error(case, *(case.stored[k] for k in ("obs", "action", "reward", "next_obs", "terminated")))  # type: ignore[index]
+    assert got == pytest.approx((errors**2).mean())
+
+
 def test_a_missing_column_is_named_with_the_line_that_writes_it() -> None:
     rows = experience()
     del rows["truncated"]
@@ -481,6 +655,7 @@ def test_exact_regret_is_nothing_for_the_best_values_and_what_it_is_for_others()
     assert exactly.against_optimum(stays).value > 1 and exactly.against_optimum(stays).flagged
 
 
+@pytest.mark.slow
 def test_states_that_are_seen_as_features_are_answered_exactly_too() -> None:
     """FrozenLake one-hot, twice as large: the values of a row are those of the state behind it."""
 

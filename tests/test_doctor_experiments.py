@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -15,11 +16,14 @@ from torch import nn
 from neuralq.doctor import Settings, examine
 from neuralq.doctor.exam.capacity import t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
+from neuralq.doctor.exam.seeds import luck_of, seeds_needed
 from neuralq.doctor.exam.signs import fresh
-from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, fit
+from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, fit, run_experiments, separating
 from neuralq.doctor.findings import Finding
+from neuralq.doctor.loading import load_subject
 from neuralq.doctor.play import Clock
 from neuralq.doctor.subject import of_network
+from neuralq.doctor.tree import decide
 from neuralq.doctor.worlds import open_world
 from neuralq.types import Array
 
@@ -85,10 +89,10 @@ def test_a_repair_is_confirmed_by_what_runs_return_and_by_nothing_else(monkeypat
     monkeypatch.setattr(_Plan, "run", run)
     known = Settings(learning_rate=0.05, capacity=500, updates=1000, env_steps=4000, target_period_updates=20)
     case = case_of(nn.Sequential(nn.Linear(1, 7), nn.ReLU(), nn.Linear(7, 2)), known)
-    plan, baseline = _Plan(case, 3), list[float]()
-    helps = _repaired(plan, _Repair("lr", "algorithm", named("R1"), {"learning_rate": 0.005}), baseline)
+    plan = _Plan(case, 3)
+    helps = _repaired(plan, _Repair("lr", "algorithm", named("R1"), {"learning_rate": 0.005}))
     assert helps.flagged and helps.value == 10 and helps.grade == "A" and helps.interval is not None
-    idle = _repaired(plan, _Repair("x", "algorithm", named("R1"), {"num_steps": 2}), [])
+    idle = _repaired(plan, _Repair("x", "algorithm", named("R1"), {"num_steps": 2}))
     assert not idle.flagged and idle.value == 0
     before, _ = next(one for one in asked if one[0]["learning_rate"] == 0.05)
     assert before == {
@@ -124,6 +128,94 @@ class Beat(gym.Env[Any, Any]):
         paid = float((self.x > 0) == bool(action))
         self.t += 1
         return self._draw(), paid, self.t == 20, False, {}
+
+
+def beat(subject: Any) -> Case:
+    loaded = load_subject(subject)
+    return begin(loaded, open_world(Beat), 0.5, loaded.settings, None, 0, Clock(600.0), lambda text: None)
+
+
+@pytest.fixture(scope="module")
+def failed() -> Case:
+    """A net whose greedy policy is one action, and so is right half of the time: 10 of 20."""
+    net = nn.Sequential(nn.Linear(1, 8), nn.ReLU(), nn.Linear(8, 2))
+    for p in net.parameters():
+        nn.init.zeros_(p)
+    return beat(net)
+
+
+@pytest.mark.parametrize(
+    ("returns", "share", "needed", "interval"),
+    [
+        ([20.0, 10.0, 19.0, 9.0], 0.5, 5, (0.0676, 0.9324)),  # Clopper and Pearson's, of a table
+        ([10.0, 11.0, 9.0, 10.5], 0.0, 0, (0.0, 0.6024)),  # none: 1 − 0.025^(1/4)
+        ([20.0, 20.0, 19.0, 18.5], 1.0, 1, (0.3976, 1.0)),  # all: it was not the seed
+    ],
+)
+def test_it_was_luck_where_the_same_settings_succeed_with_some_seeds_and_only_there(
+    failed: Case, returns: list[float], share: float, needed: int, interval: tuple[float, float]
+) -> None:
+    found = luck_of(failed, returns, "their settings")
+    assert found.value == share and found.flagged == (0 < share < 1) and found.cause == "luck"
+    assert found.interval == pytest.approx(interval, abs=1e-4)
+    assert seeds_needed(share) == needed and f"train {needed} seeds" in found.remedy
+
+
+def test_where_the_subject_is_one_of_those_that_succeed_there_is_nothing_to_explain() -> None:
+    well = beat(lambda s: np.eye(2)[(s[:, 0] > 0).astype(int)])
+    assert not luck_of(well, [20.0, 10.0, 19.0, 9.0], "their settings").flagged
+
+
+def test_how_many_seeds_it_takes() -> None:
+    for share in (0.05, 0.3, 0.5, 0.9):
+        n = seeds_needed(share)
+        assert 1 - (1 - share) ** n >= 0.95 > 1 - (1 - share) ** (n - 1)
+
+
+def of(name: str, cause: Any) -> Finding:
+    return Finding(name, name, cause, "B", 1.0, flagged=True)
+
+
+LEADING: dict[str, tuple[list[Finding], Any, str]] = {
+    "its settings or its data": ([named("R1"), of("D3", "data")], "algorithm", "X3 X2 X1"),
+    "its network or its learner": ([of("R7", "representation"), named("V5")], "algorithm", "X2 X3 X1"),
+    "nothing but a bad policy": ([named("V1")], None, "X2 X1"),
+    "a learner or the environment": ([named("V3"), of("E6", "environment")], None, "X1 X2"),
+    "the environment or luck": ([of("E6", "environment"), of("X5", "luck")], "algorithm", "X1 X2 X3"),
+    "what neither can tell": ([named("V3"), of("D5", "data")], None, "X2 X1"),
+}
+
+
+@pytest.mark.parametrize("name", LEADING)
+def test_the_experiment_that_tells_the_leading_causes_apart_comes_first(name: str) -> None:
+    findings, repairs, order = LEADING[name]
+    names, why = separating(findings, repairs)
+    assert names == order.split() and why.startswith(", ".join(names))
+    assert ("none tells" in why) == (name == "what neither can tell")
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_experiments_keep_to_that_order_say_why_and_find_luck_in_their_runs(
+    failed: Case, monkeypatch: pytest.MonkeyPatch, half: bool
+) -> None:
+    """The runs are stood in for: whatever is changed, every other seed succeeds, or none does."""
+
+    def run(self: _Plan, settings: Any, seed: int, steps: int, make: Any) -> float:
+        return 20.0 if half and seed % 2 == 0 else 10.0
+
+    monkeypatch.setattr(_Plan, "run", run)
+    monkeypatch.setattr("neuralq.doctor.experiments.fit", lambda case, seeds: replace(of("X2", "data"), flagged=False))
+    said: list[str] = []
+    found = run_experiments(failed, [named("R1"), of("D3", "data")], 4, said.append)
+    assert [text.split()[1].rstrip(":") for text in said] == ["X3", "X2", "X1"]
+    assert "X3 first" in found.why and "algorithm a gain, data none" in found.why
+    luck = next(one for one in found.findings if one.id == "X5")
+    assert luck.flagged == half and luck.value == 0.5 * half
+    findings, headline = decide([named("V1"), named("V2"), named("V5"), *found.findings])
+    assert headline.startswith("Luck") == half and (findings[0].id == "X5") == half
+    if half:
+        first, second = decide([luck, of("E3", "environment")])[0]
+        assert (first.id, second.id, second.grade) == ("E3", "X5", "B")
 
 
 @pytest.mark.slow

@@ -62,12 +62,12 @@ def test_a_learner_without_mistakes_passes_every_probe() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in ("limit", "mixed") else pytest.param(name, marks=pytest.mark.slow) for name in MISTAKES]
+    "name", [name if name == "limit" else pytest.param(name, marks=pytest.mark.slow) for name in MISTAKES]
 )
 def test_each_mistake_fails_the_probe_that_is_meant_for_it(name: str) -> None:
     mistake, number = MISTAKES[name]
-    assert number in first_broken(**mistake)
-    assert number == first_broken(**mistake)[0] or name in ("noise",)
+    broken = first_broken(**mistake)
+    assert number in broken and (number == broken[0] or name == "noise")
 
 
 def test_known_values_are_the_expected_returns_of_the_environments() -> None:
@@ -77,7 +77,7 @@ def test_known_values_are_the_expected_returns_of_the_environments() -> None:
         env, rng = ProbeEnv(one), np.random.default_rng(0)
         env.reset(seed=0)
         total: dict[tuple[float, int], list[float]] = {}
-        for _ in range(600):
+        for _ in range(300):
             s, _ = env.reset()
             a, first, steps, paid = int(rng.integers(one.num_actions)), float(s[0]), 0, 0.0
             b, over = a, False

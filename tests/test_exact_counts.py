@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neuralq.exact import Solution, policies, solve
+from neuralq.exact import Solution, policies, solve, sweeping
 from neuralq.exact.policies import policy_values
 from neuralq.exact.problem import prepare
 from neuralq.mdp import FiniteMDP
@@ -131,6 +131,30 @@ def test_sweeps_of_a_policy_are_counted(gamma: float) -> None:
         assert counts(solve(slow.mdp, gamma, "modified-policy-iteration", tol), slow) == expected
 
 
+def test_the_error_of_a_factored_evaluation_grows_with_the_steps_that_it_looks_ahead() -> None:
+    mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]])
+    for gamma in (0.5, 0.999):
+        problem = prepare(mdp, gamma)
+        v, error, sweeps = policy_values(problem, np.arange(2), np.zeros(2))
+        assert v == pytest.approx([1 / (1 - gamma**2), gamma / (1 - gamma**2)]) and sweeps == 0
+        assert error == pytest.approx(2 / (1 - gamma) * problem.rounding(v))
+
+
+def test_a_span_that_falls_no_more_is_waited_for_twenty_times() -> None:
+    problem = prepare(FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]]), 1 - 1e-6)
+
+    def patience(progress: sweeping._Progress) -> int:
+        progress.stalls(1.0)
+        return next(n for n in range(2, 10**6) if progress.stalls(1.0))
+
+    assert patience(sweeping._Progress(problem, span=True)) == 22  # the first is a low; 20 may be none; then one more
+    assert patience(sweeping._Progress(problem, span=False)) == 100_002
+    constant, v = sweeping._Constant(problem, 1e-300), np.zeros(2)
+    assert not any(constant.settles(v, 1.0, 1.0 + 2**-20, last=False) for _ in range(21))
+    assert not constant.settles(v, 1.0, 1.0 + 2**-20, last=False)  # it stalls: the constant is taken out
+    assert v[0] > 1e5 and constant._progress._patience == 20
+
+
 def test_an_evaluation_by_sweeps_looks_at_its_policy_again_after_two_hundred() -> None:
     # 0 → 1 → 0 with γ near 1: the span of the change shrinks by γ a sweep, never by a thousand in two hundred.
     mdp = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[1.0], [0.0]])
@@ -159,6 +183,19 @@ def test_policies_are_counted_whether_factored_or_swept(monkeypatch: pytest.Monk
         assert iterations == evaluations and np.abs(swept.v - factored.v).max() <= swept.bound + factored.bound
         # Of 20 states each sweep backs up one row; the first policy takes about log(ε)/log(γ) of them.
         assert (backups - evaluations * slow.rows) % 20 == 0 and backups - evaluations * slow.rows > 20 * 300
+
+
+def test_a_linear_program_counts_the_sweeps_that_evaluate_its_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = Slow(0, 0.9)
+    assert counts(solve(slow.mdp, 0.9, "linear-programming"), slow)[1] == 0  # factored
+    monkeypatch.setattr(policies, "_MOST_FACTORED", 19)
+    backups = counts(solve(slow.mdp, 0.9, "linear-programming"), slow)[1]
+    assert backups >= 20 and backups % 20 == 0
+
+
+def test_paths_are_looked_for_no_longer_than_is_said() -> None:
+    chain = FiniteMDP.from_arrays([np.eye(6, k=1)], [[-1.0]] * 5 + [[np.nan]])
+    assert [solve(chain, 1.0, "bellman-ford", max_iterations=n).iterations for n in (1, 2, 100)] == [1, 2, 6]
 
 
 def test_the_error_of_an_evaluation_by_sweeps_is_no_less_than_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -185,6 +185,32 @@ def long_run(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return lazy
 
 
+def test_values_at_the_end_of_a_horizon_are_those_that_were_given() -> None:
+    ends = FiniteMDP.from_arrays([[[0.5, 0.5], [0.0, 0.0]]], [[1.0], [np.nan]])  # the second state is terminal
+    assert solve_finite_horizon(ends, 1, 0.5, terminal_values=[8.0, 0.0]).v[0].tolist() == [1 + 0.5 * 0.5 * 8, 0.0]
+
+
+@pytest.mark.parametrize(("off", "ties"), [(1.5, True), (2.5, False)])
+def test_at_a_horizon_actions_tie_that_two_bounds_do_not_tell_apart(off: float, ties: bool) -> None:
+    bound = solve_finite_horizon(FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[1.0, 1.0]]), 1).bound
+    answer = solve_finite_horizon(FiniteMDP.from_arrays([[[1.0]], [[1.0]]], [[1.0, 1.0 - off * bound]]), 1)
+    assert answer.optimal_actions[0, 0].tolist() == [True, ties]
+
+
+def test_a_sweep_bounds_the_gain_by_half_the_span_of_its_change() -> None:
+    flip = FiniteMDP.from_arrays([[[0.0, 1.0], [1.0, 0.0]]], [[0.0], [4.0]])
+    swept = solve_average(flip, "relative-value-iteration", max_iterations=1)
+    assert swept.gain.tolist() == [2.0, 2.0] and swept.bound == pytest.approx(2.0) and not swept.converged
+
+
+def test_a_class_counts_wherever_the_end_stands_among_them() -> None:
+    """0 ends, 1 and 2 lead to each other: the end is a class too, and here not the last."""
+    chain = [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    found = evaluate_average(FiniteMDP.from_arrays([chain], [[1.0], [2.0], [3.0]], substochastic=True), [0, 0, 0])
+    assert found.gain.tolist() == [0.0, 2.5, 2.5] and found.bias == pytest.approx([1.0, -0.25, 0.25])
+    assert (found.recurrent_class >= 0).tolist() == [False, True, True]
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_average_reward_by_enumeration(seed: int) -> None:

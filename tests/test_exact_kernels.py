@@ -248,6 +248,12 @@ def test_a_future_is_settled_whole_or_backed_up_from_its_end() -> None:
         assert settle(rows, v, 0, 0.25, settled, seen, path) == (solved, used) and not seen.any()
         assert settled[:3].tolist() == [solved] * 3
         assert v.tolist() == ([-2.75, -1.75, -1.0, 0.0] if solved else [-3.0, -2.0, -1.0, 0.0])
+    # Beside a state that is off, what follows the others is looked at too: 0 leads to 1 (off) and 2, and 2 to 3.
+    fork = np.array([[0, 0.5, 0.5, 0, 0], [0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 0], [0, 0, 0, 0, 1.0], [0, 0, 0, 0, 0]])
+    branching = FiniteMDP.from_arrays(fork[None], [[-1.0]] * 4 + [[np.nan]])
+    v, path, settled = np.array([2.0, 0.0, 6.0, 7.0, 0.0]), np.empty(5, dtype=np.int64), branching.is_terminal.copy()
+    assert settle(rows_of(branching, 1.0), v, 0, 0.25, settled, np.zeros(5, dtype=bool), path) == (False, 4 + 4)
+    assert v.tolist() == [-2.5, -1.0, -2.0, -1.0, 0.0] and settled.tolist() == [False] * 4 + [True]
     settled = np.array([False, True, False, True])  # what is settled is not looked into
     assert settle(rows, np.array([-3.0, -2.0, 5.0, 0.0]), 0, 0.0, settled, seen, path) == (True, 1)
     assert settled.tolist() == [True, True, False, True]

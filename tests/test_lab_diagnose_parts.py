@@ -225,6 +225,13 @@ def test_a_run_through_pieces_keeps_what_nothing_sees() -> None:
     assert found.fixed_point_error == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize(("name", "known"), [("gq", True), ("expected-sarsa", True), ("q-learning", False)])
+def test_errors_are_known_of_the_values_of_a_policy_that_stands(name: str, known: bool) -> None:
+    found = diagnose(star_control(), name)
+    assert [x is not None for x in (found.best_error, found.fixed_point_error, found.scale)] == [known] * 3
+    assert found.best_error == (pytest.approx(0.0, abs=1e-9) if known else None)
+
+
 class Straight:
     """Values that are linear in the weights, given as those that need not be."""
 

@@ -331,3 +331,24 @@ def test_where_nothing_moves_nothing_grows() -> None:
     for sampling in ("iid", "markov"):
         assert mean_radius(still, sampling) == second_moment_radius(still, sampling) == 0.0
         assert len(growth_factors(still, sampling)) == 0 and second_moment_stable(still, sampling)
+
+
+@pytest.mark.parametrize("most", [1000, 0])
+@pytest.mark.parametrize(("first", "second"), [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)])
+def test_every_class_of_a_chain_has_to_settle(
+    first: float, second: float, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rows, each of which leads to itself; by a linear system, and by eigenvalues."""
+    monkeypatch.setattr(moments, "LARGEST_DENSE", most)
+    # ARPACK wants more than one number.
+    monkeypatch.setattr(moments, "_leading", lambda one, power: one.M[0, 0] ** power)
+    M, each, half = np.array([[[first]], [[second]]]), np.arange(2), np.full(2, 0.5)
+    maps = UpdateMaps(M, np.zeros((2, 1)), each, each, np.ones(2), half, half)
+    assert second_moment_stable(maps, "markov") == (max(first, second) < 1)
+
+
+def test_a_step_to_the_first_row_is_no_end() -> None:
+    # The first row leads to itself and doubles θ; what ends begins again in the second, which never comes back.
+    rows, D, start = np.array([0, 1]), np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    maps = UpdateMaps(np.array([[[2.0]], [[0.5]]]), np.zeros((2, 1)), rows, rows, np.ones(2), D, start)
+    assert mean_radius(maps, "markov") == pytest.approx(2.0) and not second_moment_stable(maps, "markov")

@@ -15,6 +15,8 @@ import pytest
 
 from neuralq.lab.problems import problem
 from neuralq.lab.trial import run
+from neuralq.lab.verdicts import remedies as remedies_module
+from neuralq.lab.verdicts.critical import StabilityScan
 from neuralq.lab.verdicts.diagnosis import diagnose
 from neuralq.lab.verdicts.remedies import (
     Remedy,
@@ -58,6 +60,26 @@ def test_less_of_a_change_is_not_enough(remedies: list[Remedy]) -> None:
         short = {"period": edge - 1, "num_steps": edge - 1, "tau": min(edge * 1.01, 1.0)}.get(one.kind, edge * 0.99)
         trained = run(one.problem, one.method, 10**9, one.step_size, options={**one.options, one.kind: float(short)})
         assert trained.diverged.any(), one.change
+
+
+def test_of_two_stable_ranges_the_one_at_the_usual_end_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stable from 1 to 2 and from 5 to 9: τ is lowered from the upper end, all else raised from the lower."""
+    taken: dict[str, tuple[float, float]] = {}
+
+    def two_ranges(problem: Problem, parameter: str, step_size: float) -> StabilityScan:
+        values, margins = np.array([1.0, 9.0]), np.ones(2)
+        return StabilityScan("toy", "td", parameter, step_size, values, margins, (2.0, 5.0))
+
+    def note(
+        kind: str, problem: Problem, chosen: Any, options: dict[str, float], alpha: float, edge: float, *_: str
+    ) -> None:
+        taken[kind] = (edge, round(options[kind], 3))
+
+    monkeypatch.setattr(remedies_module, "scan", two_ranges)
+    monkeypatch.setattr(remedies_module, "_remedy", note)
+    list(remedies_module._parameters(problem("baird"), 0.1))
+    low = {"lambda_": 1.1, "eta": 1.072, "phi": 1.1, "num_steps": 2.0, "period": 2.0, "beta_over_alpha": 1.072}
+    assert taken == {**{name: (1.0, value) for name, value in low.items()}, "tau": (9.0, 8.486)}
 
 
 def test_the_best_comes_first(remedies: list[Remedy]) -> None:

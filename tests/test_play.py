@@ -197,7 +197,8 @@ def test_the_shell_refuses_what_is_foreign_or_no_json(client: TestClient) -> Non
 def test_the_pages_name_nothing_outside(client: TestClient) -> None:
     noughts = TestClient(play_app(tictactoe()), base_url="http://127.0.0.1")
     for path in ("/", "/static/backgammon.js", "/static/board.js", "/static/seat.js", "/static/turns.js",
-                 "/static/play.css", "/static/tictactoe.js", "/static/tictactoe.css"):  # fmt: skip
+                 "/static/play.css", "/static/tictactoe.js", "/static/tictactoe.css", "/static/checkers.js",
+                 "/static/checkers.css"):  # fmt: skip
         for reply in (client.get(path), noughts.get(path)):
             assert reply.status_code == 200
             assert "//" not in reply.text.replace("http://www.w3.org/2000/svg", "").replace("// ", ""), path
@@ -331,9 +332,11 @@ def test_what_the_command_does_not_understand(capsys: pytest.CaptureFixture[str]
     for argv, says in (
         ([], "GAME"),
         (["chess"], "chess"),
-        (["tictactoe", "--agent", "x"], "--agent and --plies are for backgammon"),
-        (["tictactoe", "--plies", "2"], "--agent and --plies are for backgammon"),
-        (["backgammon", "--plies", "3"], "--plies"),
+        (["tictactoe", "--agent", "x"], "--agent is for backgammon"),
+        (["checkers", "--agent", "x"], "--agent is for backgammon; checkers is played by the weights shipped"),
+        (["tictactoe", "--plies", "2"], "--plies is for backgammon and checkers"),
+        (["backgammon", "--plies", "3"], "--plies must lie in 1..2 for backgammon, got 3"),
+        (["checkers", "--plies", "1"], "--plies must lie in 2..11 for checkers, got 1"),
         (["backgammon", "--port", "70000"], "--port must lie in 0..65535"),
     ):
         assert run(argv) == 2

@@ -133,6 +133,16 @@ ONE = np.zeros((1, 2))
         (lambda: rules.squared_slopes(torch.ones(2, 3), torch.ones(3)), ValueError, "weight must have the shape"),
         (lambda: rules.input_slopes(torch.ones(2), torch.ones(2, 3)), ValueError, r"call s.requires_grad_\(\)"),
         (
+            lambda: rules.input_slopes(torch.ones(2), torch.ones(2, 3, requires_grad=True)),
+            ValueError,
+            "computed from s",
+        ),
+        (
+            lambda: rules.input_slopes(torch.ones(2, requires_grad=True), torch.ones(2, 3)),
+            ValueError,
+            "computed from s",
+        ),
+        (
             lambda: rules.return_slopes(torch.ones(2, 3), torch.ones(2), torch.ones(2, 2, 3), torch.ones(3)),
             ValueError,
             "a column of jacobian_t",

@@ -167,7 +167,7 @@ def test_what_was_given_up_is_said_to_be_more() -> None:
     assert str(Measured("f", (3, 10), 10)) == "6.5 (2 seeds: 3 to over 10)"
 
 
-LONG = {"checkers"}
+LONG = {"checkers", "elevators", "job-shop"}
 """Systems whose kernels take longer to compile than the fast tests have time."""
 
 

@@ -21,7 +21,7 @@ _HOLD_SECONDS = 1.2  # a trial that ended stays for a while before it starts aga
 _METRE, _WIDTH, _HEIGHT, _GROUND = 120, 640, 164, 150
 
 FILM_STYLE = """
-.film:has(> input) { display: block; }
+.film { display: block; }
 .film svg { display: block; width: 100%; height: auto; }
 .film p { display: flex; justify-content: space-between; gap: 1rem; margin: .7rem 0 0; max-width: none; }
 .film .end { color: var(--soft); opacity: 0; white-space: nowrap; }

@@ -12,7 +12,14 @@ import numpy as np
 
 from neuralq.types import Array, Floats
 
-__all__ = ["area_under_curve", "bounds_of", "held_out_r2", "held_out_scores", "rank_correlation"]
+__all__ = [
+    "area_under_curve",
+    "bounds_of",
+    "held_out_r2",
+    "held_out_scores",
+    "rank_correlation",
+    "td_against_monte_carlo",
+]
 
 _RESAMPLES = 1000
 _NUM_FEATURES = 300
@@ -113,6 +120,32 @@ def _features(x: Array, rng: np.random.Generator) -> Floats:
     )
     made: Floats = np.concatenate([np.ones((len(x), 1)), scaled, np.cos(angles)], axis=1)
     return made
+
+
+def td_against_monte_carlo(
+    x: Array, rewards: Array, x_t: Array, ended: Array, returns: Array, gamma: float, rng: np.random.Generator
+) -> float:
+    """The λ-discrepancy of a policy's values (Allen et al. 2024): TD(0) against Monte Carlo, over returns' spread.
+
+    Both are linear in the same features, at the fixed point of TD(0) (Bradtke & Barto 1996) and by least squares. Where
+    observations are states both are its values; where states look alike they differ.
+
+    Args:
+        x: what is seen, ``[N, d]``.
+        rewards: ``[N]``.
+        x_t: what is seen next, ``[N, d]``.
+        ended: whether the world ended there, ``[N]``.
+        returns: discounted returns from x on, ``[N]``.
+        gamma: γ of the returns.
+        rng: draws the features.
+    """
+    both = _features(np.concatenate([x, x_t]), rng)
+    now, ahead = both[: len(x)], both[len(x) :] * ~ended[:, None]
+    penalty = 1e-6 * len(x) * np.eye(now.shape[1])
+    by_td = np.linalg.solve(now.T @ (now - gamma * ahead) + penalty, now.T @ rewards)
+    by_returns = np.linalg.solve(now.T @ now + penalty, now.T @ returns)
+    apart = float(np.sqrt(((now @ (by_td - by_returns)) ** 2).mean()))
+    return apart / max(float(returns.std()), 1e-12)
 
 
 def held_out_r2(x: Array, y: Array, episode: Array, rng: np.random.Generator) -> Floats:

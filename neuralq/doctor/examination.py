@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from neuralq.checks import check_choice, check_discount, check_positive, check_whole
-from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, stored, values
+from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, seeds, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
 from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
@@ -35,6 +35,7 @@ _GAMMA = 0.99
 
 _MEASUREMENTS: dict[str, Measurement] = {
     "V1": values.has_learned,
+    "X5": seeds.luck,
     "V4": values.soft_divergence,
     "V5": values.reach,
     "V2": values.bias,
@@ -161,14 +162,18 @@ def _examined(
         return _broken(subject, world, gamma, clock, str(error))
     measured, missing = _measured(case, say)
     findings, headline = decide(measured)
-    drawn = _drawn(case)
+    drawn, why = _drawn(case), ""
     if seeds:
         tried = run_experiments(case, [one for one in findings if one.grade in "AB"], seeds, say)
-        measured, missing = [*measured, *tried.findings], {**missing, **tried.missing}
+        measured = [*measured, *tried.findings]
+        missing = {name: why for name, why in missing.items() if name != "X5"} | tried.missing
         findings, headline = decide(measured)
+        why = tried.why
         if tried.factorial is not None:
             drawn["factorial"] = tried.factorial
-    return Report(subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, drawn)
+    return Report(
+        subject.origin, world.name, gamma, headline, findings, tuple(measured), missing, clock.spent, drawn, why
+    )
 
 
 def _measured(case: Case, say: _Teller) -> tuple[list[Finding], dict[str, str]]:
@@ -257,7 +262,7 @@ def _drawn(case: Case) -> dict[str, Array]:
         if len(returns):
             q = one.values[np.arange(len(returns)), one.actions[: len(returns)]]
             pairs.append(np.column_stack([returns, q]))
-            starts.append([one.score, one.values[0].max(), returns[0]])
+            starts.append([one.score, one.legal_values[0].max(), returns[0]])
     if not pairs:
         return {}
     points = np.concatenate(pairs)

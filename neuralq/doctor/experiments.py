@@ -1,4 +1,4 @@
-"""X1–X3: controlled experiments: one thing is changed at a time, with the same seeds and an interval.
+"""X1–X3 and X5: controlled experiments: one thing is changed at a time, with the same seeds and an interval.
 
 * X2, *fit*: can the subject's architecture represent the returns of the policy at hand? A fresh copy of it and a body
   of ours (two layers of 256 with LayerNorm, observations normalised) are regressed on them, split by episode. Only the
@@ -9,6 +9,10 @@ the one thing is changed that a measurement named.
 * X1, *factorial*: {its algorithm, ours (λ-returns)} × {its body, ours}. What changes the algorithm gains over both
   bodies speaks against the algorithm, what changes the body gains over both algorithms against the representation
   (oracles swapped in one at a time: Fu et al. 2019).
+
+* X5, *luck*: of the runs that those made with one and the same settings, do some succeed and others not (`exam.seeds`)?
+
+What is tried first, and so has most of the budget, is what tells the two leading causes apart (`separating`).
 
 Learners are neuralq's own: what is tried is what was done,
 not somebody else's code. Steps are so many that all runs fit
@@ -33,14 +37,15 @@ from torch import nn
 from neuralq.doctor.exam.capacity import labelled, regressed, t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.exam.retraining import further_reach, in_words, settings_of
+from neuralq.doctor.exam.seeds import luck_of
 from neuralq.doctor.exam.signs import fresh
-from neuralq.doctor.findings import Cause, Finding
+from neuralq.doctor.findings import CAUSES, Cause, Finding
 from neuralq.runs import train
 from neuralq.runs.recipe.stand_in import Maker
 from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.types import Floats
 
-__all__ = ["Experiments", "fit", "run_experiments"]
+__all__ = ["Experiments", "fit", "run_experiments", "separating"]
 
 _FEWEST_STEPS, _MOST_STEPS = 2_000, 50_000
 _OUR_HIDDEN = (256, 256)
@@ -54,30 +59,92 @@ class Experiments:
     Args:
         findings: of grade A.
         missing: what could not be tried, and why.
+        why: in which order they were tried, and why.
         factorial: mean greedy returns ``[2, 2]``: bodies (theirs, ours) by algorithms (theirs, ours).
     """
 
     findings: list[Finding] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
+    why: str = ""
     factorial: Floats | None = None
 
 
+_PREDICTED: dict[str, dict[Cause, str]] = {
+    "X2": dict.fromkeys(CAUSES, "no gap") | {"representation": "a gap"},
+    "X1": {
+        "environment": "no run does well",
+        "algorithm": "another algorithm does better",
+        "representation": "another body does better",
+        "data": "another algorithm does better",
+        "luck": "some seeds do well",
+    },
+}
+"""What each cause predicts of an experiment. A learner brings its data along: X1 does not tell these apart."""
+
+
+def separating(named: Sequence[Finding], repairs: Cause | None) -> tuple[list[str], str]:
+    """The experiments in the order of their use, and why: first what the two leading causes predict differently.
+
+    The leading causes are the first two of what is named; beside one alone the rival is the representation, or the
+    algorithm where that one is the representation. Among what separates them the cheapest comes first: X2 fits, X3 is
+    two runs of each seed, X1 four.
+
+    Args:
+        named: findings of grade A or B, the first cause first.
+        repairs: the cause that X3's repair speaks for; None where there is no repair.
+
+    Example:
+        >>> separating([Finding("V1", "", "algorithm", "B", 1.0)], None)[0]
+        ['X2', 'X1']
+    """
+    found: list[Cause] = list(dict.fromkeys(one.cause for one in named)) or ["algorithm"]
+    rivals: tuple[Cause, ...] = ("representation", "algorithm")
+    first, second = [*found, *(one for one in rivals if one not in found)][:2]
+    predicted = {
+        "X2": _PREDICTED["X2"],
+        "X3": dict.fromkeys(CAUSES, "none") | {repairs: "a gain"} if repairs is not None else {},
+        "X1": _PREDICTED["X1"],
+    }
+    usable = [name for name, table in predicted.items() if table]
+    apart = [name for name in usable if predicted[name][first] != predicted[name][second]]
+    order = [*apart, *(name for name in usable if name not in apart)]
+    if not apart:
+        return order, f"{', '.join(order)}: none tells {first} from {second}, the leading causes; the cheapest first"
+    told = predicted[apart[0]]
+    return order, (
+        f"{', '.join(order)}: {apart[0]} first, of which the leading causes predict different things: {first} "
+        f"{told[first]}, {second} {told[second]}"
+    )
+
+
 def run_experiments(case: Case, named: Sequence[Finding], seeds: int, say: Callable[[str], None]) -> Experiments:
-    """X2, then the repair of what is named first, then the factorial, as far as the budget goes."""
-    found = Experiments()
-    say("experiment X2: can the network represent the returns?")
-    _try(found, "X2", lambda: fit(case, seeds))
-    baseline: list[float] = []
-    plan = _Plan(case, seeds)
+    """X1 to X3 in the order that tells the leading causes apart, as far as the budget goes; then X5 of their runs."""
+    found, plan = Experiments(), _Plan(case, seeds)
     repair = next((r for one in named if (r := _repair(case, one)) is not None), None)
     if repair is None:
         found.missing["X3"] = "no finding names one thing that could be changed in a learner of ours"
-    else:
-        say(f"experiment X3: {repair.title}")
-        _try(found, "X3", lambda: _repaired(plan, repair, baseline))
-    say("experiment X1: their algorithm and body, and ours")
-    _try(found, "X1", lambda: _factorial(plan, found))
+    order, found.why = separating(named, None if repair is None else repair.cause)
+    experiments: dict[str, tuple[str, Callable[[], Finding | Sequence[Finding]]]] = {
+        "X2": ("can the network represent the returns?", lambda: fit(case, seeds)),
+        "X1": ("their algorithm and body, and ours", lambda: _factorial(plan, found)),
+    }
+    if repair is not None:
+        experiments["X3"] = (repair.title, lambda: _repaired(plan, repair))
+    for name in order:
+        title, experiment = experiments[name]
+        say(f"experiment {name}: {title}")
+        _try(found, name, experiment)
+    if not case.subject.siblings:
+        _try(found, "X5", lambda: _luck(plan))
     return found
+
+
+def _luck(plan: _Plan) -> Finding:
+    """X5: of the runs with the subject's settings; where none of those succeeds, of ours."""
+    own = luck_of(plan.case, plan.same["theirs"], f"the subject's settings, learned by neuralq ({plan.steps:,} steps),")
+    if own.value == 0 and len(plan.same["ours"]) > 1:
+        return luck_of(plan.case, plan.same["ours"], "our learner and body")
+    return own
 
 
 def _try(found: Experiments, name: str, experiment: Callable[[], Finding | Sequence[Finding]]) -> None:
@@ -186,7 +253,8 @@ class _Plan:
     """Runs of neuralq's learners: how they are set, and how many steps the budget allows each."""
 
     def __init__(self, case: Case, seeds: int) -> None:
-        self.case, self.seeds = case, seeds
+        self.case, self.seeds, self.steps = case, seeds, 0
+        self.same: dict[str, list[float]] = {"theirs": [], "ours": []}
         self._rate: float | None = None
 
     def theirs(self) -> dict[str, Any]:
@@ -214,7 +282,8 @@ class _Plan:
                 f"the budget allows {steps:,} steps for each of {runs} runs, and {_FEWEST_STEPS:,} are the least; give "
                 "more with --budget"
             )
-        return min(steps, int(self.case.settings.env_steps or _MOST_STEPS), _MOST_STEPS)
+        self.steps = min(steps, int(self.case.settings.env_steps or _MOST_STEPS), _MOST_STEPS)
+        return self.steps
 
     def run(self, settings: Mapping[str, Any], seed: int, steps: int, make: Maker | None) -> float:
         """The greedy return that one run ends with."""
@@ -230,10 +299,11 @@ class _Plan:
         return float(made.greedy_return if made.greedy_return is not None else np.nan)
 
 
-def _repaired(plan: _Plan, repair: _Repair, baseline: list[float]) -> Finding:
+def _repaired(plan: _Plan, repair: _Repair) -> Finding:
     steps = plan.steps_for(2 * plan.seeds)
     before = {**plan.theirs(), **plan.their_body()}
-    baseline += [plan.run(before, seed, steps, None) for seed in range(plan.seeds)]
+    baseline = [plan.run(before, seed, steps, None) for seed in range(plan.seeds)]
+    plan.same["theirs"] += baseline
     after = [plan.run({**before, **repair.settings}, seed, steps, repair.make) for seed in range(plan.seeds)]
     if repair.make is not None and repair.named.id == "E5":
         after = [one * plan.case.largest_reward for one in after]
@@ -271,6 +341,8 @@ def _factorial(plan: _Plan, found: Experiments) -> list[Finding]:
     for i, (body, make) in enumerate(((plan.their_body(), None), (wide, normalised))):
         for j, algorithm in enumerate((plan.theirs(), ours)):
             cells[i, j] = [plan.run({**algorithm, **body}, 100 + seed, steps, make) for seed in range(plan.seeds)]
+    plan.same["theirs"] += cells[0, 0]
+    plan.same["ours"] += cells[1, 1]
     found.factorial = np.array([[np.mean(cells[i, j]) for j in (0, 1)] for i in (0, 1)])
     made = []
     causes: tuple[tuple[Cause, list[float], list[float]], ...] = (

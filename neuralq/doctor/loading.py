@@ -20,9 +20,9 @@ def load_subject(given: Any, net: str | None = None, env: Any = None) -> Subject
     """The value function in a file or folder, or in memory. No code in a file is ever run.
 
     Args:
-        given: a neuralq run folder; a zip of Stable-Baselines3 (DQN) or sb3-contrib (QR-DQN); a model of CleanRL; a
-            state dict (``.pth``, ``.safetensors``, ``.npz``); an `nn.Module`, a function of ``[N, *obs]`` to
-            ``[N, A]``, or what `neuralq.load` returns.
+        given: a neuralq run folder, or a sweep's, of which the worst seed is the subject; a zip of Stable-Baselines3
+            (DQN) or sb3-contrib (QR-DQN); a model of CleanRL; a state dict (``.pth``, ``.safetensors``, ``.npz``); an
+            `nn.Module`, a function of ``[N, *obs]`` to ``[N, A]``, or what `neuralq.load` returns.
         net: "module:Class" of a network that a state dict belongs to; it is called without arguments.
         env: the environment, of a run in whose folder it has no name that could be followed.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -48,6 +48,9 @@ def page_of(report: Report) -> Page:
             page.table(_found(one))
     _figures(page, report)
     _vital_signs(page, report)
+    if report.experiments:
+        page.heading("Experiments")
+        page.paragraph(f"In the order {report.experiments}.")
     _factorial(page, report)
     page.heading("What was not measured, and why")
     if report.not_measured:
@@ -143,12 +146,64 @@ def _scatter(
     return draw_svg(name, beside, said, (5.2, 3.6), paint)
 
 
+_SIGNS = {
+    "R1": "silent units, beyond the mean of fresh networks (share)",
+    "R2": "effective rank of the last hidden layer (directions)",
+    "R3": "smallest eigenvalue of the tangent kernel",
+    "R4": "greedy actions that one step changes elsewhere (share)",
+    "R6a": "distance of the weights from where fresh ones lie",
+}
+
+
 def _vital_signs(page: Page, report: Report) -> None:
     signs = [one for one in report.measured if one.id.startswith("R")]
-    if signs:
-        page.heading("The network beside fresh ones")
-        rows = [[one.id, _number(one), one.evidence] for one in signs]
-        page.table(html_table("vital signs; alone they prove nothing", ("", "value", "in words"), rows))
+    if not signs:
+        return
+    page.heading("The network beside fresh ones")
+    drawn = [one for one in signs if one.fresh and one.id in _SIGNS and np.isfinite([one.value, *one.fresh]).all()]
+    if drawn:
+        page.figure(
+            _strips(drawn),
+            f"Bars span what {len(drawn[0].fresh)} fresh networks of the same architecture show on the same "
+            "observations, with a stroke for each of them; the diamond is this network, the dotted line a threshold "
+            "where it lies within sight. To be outside is what learning does; alone it proves nothing.",
+        )
+    rows = [[one.id, _number(one), _fresh(one), one.evidence] for one in signs]
+    page.table(
+        html_table("vital signs; alone they prove nothing", ("", "value", "of fresh networks", "in words"), rows)
+    )
+
+
+def _fresh(one: Finding) -> str:
+    return f"{format_number(min(one.fresh))} to {format_number(max(one.fresh))}" if one.fresh else "–"
+
+
+def _strips(signs: Sequence[Finding]) -> str:
+    """A strip for each sign: the band of fresh networks, each of them, this network, and the threshold."""
+
+    def paint(figure: Figure) -> None:
+        for axes, one in zip(np.atleast_1d(figure.subplots(len(signs), 1)), signs, strict=True):
+            low, high = min(one.fresh), max(one.fresh)
+            axes.barh(0, high - low, left=low, height=0.9, color=COLOURS[4], alpha=0.5, linewidth=0)
+            axes.plot(one.fresh, [0] * len(one.fresh), "|", color=COLOURS[0], markersize=14, alpha=0.8)
+            axes.plot(one.value, 0, "D", color=COLOURS[1], markersize=8)
+            ends = np.array([low, high, one.value])
+            spread = float(np.ptp(ends)) or abs(one.threshold or 1.0)
+            if one.threshold is not None and ends.min() - spread <= one.threshold <= ends.max() + spread:
+                axes.axvline(one.threshold, color="#555555", linestyle=":", linewidth=1.4)
+                ends = np.append(ends, one.threshold)
+            axes.set_xlim(ends.min() - 0.08 * spread, ends.max() + 0.08 * spread)
+            axes.set_ylim(-1, 1)
+            axes.set_yticks([])
+            axes.spines["left"].set_visible(False)
+            axes.grid(False)
+            axes.set_title(f"{one.id}: {_SIGNS[one.id]}", loc="left", fontsize="medium")
+
+    said = "; ".join(
+        f"{one.id}, {_SIGNS[one.id]}: {one.value:.3g}, fresh networks {min(one.fresh):.3g} to {max(one.fresh):.3g}"
+        for one in signs
+    )
+    return draw_svg("signs", "vital signs beside fresh networks", said, (5.2, 0.15 + 0.85 * len(signs)), paint)
 
 
 def _factorial(page: Page, report: Report) -> None:

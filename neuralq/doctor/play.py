@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,11 @@ import numpy as np
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
 
-__all__ = ["Clock", "EnvironmentRaised", "Episode", "horizon", "play", "returns_from"]
+__all__ = ["Clock", "EnvironmentRaised", "Episode", "horizon", "legal_in", "play", "returns_from"]
 
-Policy = Callable[[Array, np.random.Generator], tuple[Indices, Floats]]
-"""Observations ``[N, *obs]`` to actions ``[N]`` and the action values ``[N, A]`` that they were chosen by (or NaN)."""
+Policy = Callable[[Array, Array, np.random.Generator], tuple[Indices, Floats]]
+"""Observations ``[N, *obs]`` and which actions are legal ``[N, A]`` to actions ``[N]`` and the action values ``[N, A]``
+that they were chosen by (or NaN)."""
 
 _MOST_BYTES = 256 * 2**20
 """Of observations kept of one policy; where they are pictures, there are fewer episodes, of two at least."""
@@ -60,6 +61,7 @@ class Episode:
         terminated: whether the world ended it.
         truncated: whether the environment cut it short.
         within: steps that lie within the environment's own limit, T where there is none.
+        legal: which actions ``info["action_mask"]`` allows, ``[T + 1, A]`` bool; None where none is ever given.
     """
 
     observations: Array
@@ -69,6 +71,12 @@ class Episode:
     terminated: bool
     truncated: bool
     within: int
+    legal: Array | None = None
+
+    @property
+    def legal_values(self) -> Floats:
+        """The values, −∞ of illegal actions, which are never learned: ``[T, A]``."""
+        return self.values if self.legal is None else np.where(self.legal[:-1], self.values, -np.inf)
 
     @property
     def score(self) -> float:
@@ -112,6 +120,26 @@ def returns_from(episode: Episode, gamma: float, rest: float = 0.05) -> Floats:
     return returns[: min(known, episode.within)]
 
 
+def legal_in(info: Mapping[str, Any], num_actions: int) -> Array:
+    """Which actions ``info["action_mask"]`` allows, ``[A]`` bool; all where there is none, or none is allowed.
+
+    Raises:
+        EnvironmentRaised: the mask is not of this length.
+
+    Example:
+        >>> legal_in({"action_mask": [1, 0]}, 2).tolist(), legal_in({}, 2).tolist()
+        ([True, False], [True, True])
+    """
+    if "action_mask" not in info:
+        return np.ones(num_actions, bool)
+    legal: Array = np.asarray(info["action_mask"]) != 0
+    if legal.shape != (num_actions,):
+        raise EnvironmentRaised(
+            f"info['action_mask'] has the shape {list(legal.shape)}, and there are {num_actions} actions"
+        )
+    return legal if legal.any() else ~legal
+
+
 def play(
     world: World,
     policy: Policy,
@@ -151,11 +179,11 @@ def play(
     envs = [world.lifted() if lift else world.make() for _ in range(num_episodes)]
     rng, until = np.random.default_rng(seed), time.monotonic() + seconds
     try:
-        runs = [_Running(env, seed + i) for i, env in enumerate(envs)]
+        runs = [_Running(env, seed + i, world.num_actions) for i, env in enumerate(envs)]
         going, steps = list(runs), 0
         while going and time.monotonic() < until and steps < most_in_all:
             observations = np.stack([run.observations[-1] for run in going])
-            actions, values = policy(observations, rng)
+            actions, values = policy(observations, np.stack([run.legal[-1] for run in going]), rng)
             for run, action, row in zip(going, actions.tolist(), values, strict=True):
                 run.step(action, row, world.first_action)
             steps += len(going)
@@ -169,12 +197,14 @@ def play(
 class _Running:
     """An episode that is being played."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int) -> None:
-        self.env = env
+    def __init__(self, env: gym.Env[Any, Any], seed: int, num_actions: int) -> None:
+        self.env, self.num_actions = env, num_actions
         try:
-            first, _ = env.reset(seed=seed)
+            first, info = env.reset(seed=seed)
         except Exception as error:
             raise EnvironmentRaised(f"reset raised {type(error).__name__}: {error}") from error
+        self.masked = "action_mask" in info
+        self.legal: list[Array] = [legal_in(info, num_actions)]
         self.observations: list[Array] = [np.array(first)]
         self.actions: list[int] = []
         self.rewards: list[float] = []
@@ -187,9 +217,10 @@ class _Running:
 
     def step(self, action: int, values: Array, first_action: int) -> None:
         try:
-            observation, reward, terminated, truncated, _ = self.env.step(action + first_action)
+            observation, reward, terminated, truncated, info = self.env.step(action + first_action)
         except Exception as error:
             raise EnvironmentRaised(f"step({action + first_action}) raised {type(error).__name__}: {error}") from error
+        self.legal.append(legal_in(info, self.num_actions))
         self.observations.append(np.array(observation))
         self.actions.append(action)
         self.rewards.append(float(reward))
@@ -201,6 +232,7 @@ class _Running:
             np.stack(self.observations), np.array(self.actions, np.int64), np.array(self.rewards),
             np.stack(self.values),
             self.terminated, self.truncated, min(len(self.actions), limit),
+            np.stack(self.legal) if self.masked else None,
         )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ class Report:
         not_measured: what could not be measured, and why.
         seconds: how long it took.
         drawn: numbers for the page's figures.
+        experiments: in which order experiments were tried, and why; empty without any.
     """
 
     subject: str
@@ -40,6 +41,7 @@ class Report:
     not_measured: Mapping[str, str]
     seconds: float
     drawn: Mapping[str, Array] = field(default_factory=dict)
+    experiments: str = ""
 
     @property
     def healthy(self) -> bool:
@@ -65,6 +67,7 @@ class Report:
             lines += _wrapped(f"remedy: {one.remedy}", 2)
             lines += _wrapped(f"confirm: {one.confirm.splitlines()[0]}", 3)
         lines += ["", *(_wrapped(f"{cause:<15} {self._best_of(cause)}", 1)[0] for cause in CAUSES)]
+        lines += _wrapped(f"experiments: {self.experiments}", 2) if self.experiments else []
         for title, rest in (
             ("and", [f"{one.id} {one.title}" for one in named[1:]]),
             ("signs, no verdicts", [f"{one.id} {one.title}" for one in signs]),
@@ -97,6 +100,7 @@ class Report:
             "measured": [one.plain() for one in self.measured],
             "not_measured": dict(self.not_measured),
             "seconds": self.seconds,
+            "experiments": self.experiments,
         }
 
     def write(self, path: str | Path) -> Path:

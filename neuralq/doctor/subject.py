@@ -119,6 +119,8 @@ class Subject:
         first_action: the environment's name of action 0; None where the file does not say.
         num_actions: A; None where only a call tells.
         env: the environment that it was trained in, where the file names it.
+        siblings: greedy returns of runs with the same settings and other seeds, its own among them; empty where it was
+            given alone.
         replay: reads the experience that was stored with it, as the columns of ``data``; None where there is none.
     """
 
@@ -132,6 +134,7 @@ class Subject:
     first_action: int | None = None
     num_actions: int | None = None
     env: Any = None
+    siblings: tuple[float, ...] = ()
     replay: Callable[[], dict[str, Array] | None] | None = None
 
 

@@ -119,6 +119,4 @@ def labelled_rtdp(problem: PlanningProblem, tol: float, limit: float, seed: int)
                     backups += used
                     if not solved:
                         break
-        if iterations >= limit:
-            break
     return Found(v, iterations, backups)

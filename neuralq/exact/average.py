@@ -100,7 +100,7 @@ def evaluate_average(mdp: FiniteMDP, policy: ArrayLike) -> AverageEvaluation:
     chain, reward = policy_process(mdp, policy)
     num = mdp.num_states
     # What leaves the model rests: one more state, of gain 0.
-    missing = np.maximum(1 - np.asarray(chain.sum(axis=1)).reshape(-1), 0.0)
+    missing = np.maximum(1 - np.asarray(chain.sum(axis=1)), 0.0)
     missing[missing < 1e-9] = 0.0
     rest = sparse.csr_array([[1.0]])
     whole = sparse.csr_array(sparse.block_array([[chain, sparse.csr_array(missing[:, None])], [None, rest]]))
@@ -213,7 +213,7 @@ def _policy_iteration(
     stopped = beaten.size > 0
     gap = float(np.max(best_drift[states] - found.gain[states], initial=0.0))
     excess = float(np.max(worth[challenger[states]] - found.bias[states], initial=0.0))
-    bound = np.inf if stopped else max(gap, excess, 0.0) + float(np.finfo(np.float64).eps) * size
+    bound = np.inf if stopped else max(gap, excess) + float(np.finfo(np.float64).eps) * size
     return rows, found.bias, found.gain, iterations, bound
 
 

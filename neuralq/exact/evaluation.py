@@ -122,7 +122,7 @@ def _row_probabilities(mdp: FiniteMDP, policy: NDArray[np.generic]) -> NDArray[n
 
 
 def _may_end(P_pi: sparse.csr_array) -> NDArray[np.bool_]:
-    return np.asarray(np.asarray(P_pi.sum(axis=1)).reshape(-1) < 1 - 1e-9)
+    return np.asarray(P_pi.sum(axis=1)) < 1 - 1e-9
 
 
 def _leading_to(P_pi: sparse.csr_array, goals: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -26,7 +26,6 @@ __all__ = ["best_rows", "linear_programming", "policy_iteration", "policy_values
 _MOST_FACTORED = 3000  # states; beyond, the factors of a matrix without structure may not fit into memory
 _MOST_STEPS = 1e5  # expected steps up to which sweeps evaluate a policy in reasonable time
 _LARGEST_EVALUATION_SWEEPS = 1_000_000
-_LEAST_UNIT = 1e-3  # largest reward from which on, and up to its inverse, a linear program is solved as it stands
 
 
 def policy_iteration(
@@ -87,7 +86,7 @@ def _check_ends(problem: PlanningProblem, decay: Floats, chosen: sparse.csr_arra
     Raises:
         ArithmeticError: it does not; the policy has no finite value.
     """
-    ends = ~problem.acts | (decay * np.asarray(chosen.sum(axis=1)).reshape(-1) < 1 - 1e-9)
+    ends = ~problem.acts | (decay * np.asarray(chosen.sum(axis=1)) < 1 - 1e-9)
     while True:
         more = ends | (chosen @ ends.astype(np.float64) > 0)
         if np.array_equal(more, ends):
@@ -107,8 +106,7 @@ def linear_programming(problem: PlanningProblem, tol: float, limit: float) -> Fo
     constraints = sparse.diags_array(rows.decay) @ mdp.transition - chooses
     options = {} if limit == np.inf else {"maxiter": int(limit)}
     # Its tolerances are absolute: rewards much smaller than 1 would all be within them. A power of two rounds nothing.
-    unit = 1.0 if _LEAST_UNIT <= problem.largest_reward <= 1 / _LEAST_UNIT else problem.largest_reward or 1.0
-    unit = 2.0 ** math.floor(math.log2(unit))
+    unit = 2.0 ** math.floor(math.log2(problem.largest_reward or 1.0))
     free = np.stack([np.where(problem.acts, -np.inf, 0.0), np.where(problem.acts, np.inf, 0.0)], axis=1)
     result = linprog(
         np.ones(mdp.num_states),

@@ -159,12 +159,12 @@ def gauss_seidel(problem: PlanningProblem, tol: float, limit: float) -> Found:
         change = improve_in_place(rows, v, iterations % 2 == 1)
         iterations, backups = iterations + 1, backups + len(rows.reward)
         allowance = problem.reach * problem.rounding(v)
-        if (problem.reach - 1) * change + allowance <= tol or change == 0:
+        if (problem.reach - 1) * change + allowance <= tol:
             # The operator of one whole sweep contracts too, but the proof is about T: ask T.
             least, largest, _ = sweep(rows, v, scratch, np.inf)
             backups += len(rows.reward)
             down, up = problem.interval(least, largest)
-            if max(up, -down, 0.0) + allowance <= tol or change == 0:
+            if max(up, -down, 0.0) + allowance <= tol:
                 break
         if progress.stalls(change) or change <= problem.rounding(v):
             break

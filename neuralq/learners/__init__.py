@@ -10,16 +10,27 @@ Prediction is control with one action. True online TD(λ) is `PredictionLearner`
 linear features (its Q(λ) in runs: ``--learner online --online.trace dutch``); streaming TD(λ) is `StreamingLearner` on
 a representation with one output, which bounds its step, or `PredictionLearner`, which does not.
 
+`smdp_network_update` learns from actions that last, one decision at a time, from Python and from compiled loops.
+
 `TabularLearner` runs the compiled loops of `neuralq.tabular`: every algorithm of the chapter on a table.
 
 Where those diverge, others converge: `ResidualGradientLearner` descends the Bellman residual,
 `GradientPredictionLearner` and `GradientQLearner` the projected Bellman error step by step, `DQRCLearner` from replay.
+
+`learn_afterstates` learns values of what actions lead to, so that there may be others in every state (TD(λ), compiled).
 
 `fit_slopes` fits a small network to values and slopes at once, for whoever has a model that explains what was seen.
 
 A learner that runs can be made of ends with its `LearnerKind`; `learner_kinds` finds it, and nothing else lists it.
 """
 
+from neuralq.learners.afterstates import (
+    ValueNetwork,
+    choose_afterstate,
+    learn_afterstates,
+    new_value_network,
+    value_of,
+)
 from neuralq.learners.descent import Descent
 from neuralq.learners.gradient.correction import HeadCorrection, TangentCorrection
 from neuralq.learners.gradient.learner import GradientPredictionLearner, GradientQLearner
@@ -33,6 +44,12 @@ from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.rollout import RolloutLearner, RolloutSettings
+from neuralq.learners.semi_markov import (
+    SmdpNetwork,
+    new_smdp_network,
+    smdp_network_update,
+    smdp_network_values,
+)
 from neuralq.learners.slopes import SlopeNet, fit_slopes, new_slope_net
 from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.learners.tabular.settings import TabularSettings
@@ -64,6 +81,7 @@ __all__ = [
     "RolloutLearner",
     "RolloutSettings",
     "SlopeNet",
+    "SmdpNetwork",
     "StreamingLearner",
     "StreamingSettings",
     "TabularLearner",
@@ -72,7 +90,15 @@ __all__ = [
     "Traits",
     "TwinHead",
     "Update",
+    "ValueNetwork",
+    "choose_afterstate",
     "fit_slopes",
+    "learn_afterstates",
     "learner_kinds",
     "new_slope_net",
+    "new_smdp_network",
+    "new_value_network",
+    "smdp_network_update",
+    "smdp_network_values",
+    "value_of",
 ]

@@ -28,6 +28,7 @@ from neuralq.rules.returns import (
     watkins_lambda,
 )
 from neuralq.rules.schedules import Constant, Exponential, Linear, Power, Schedule
+from neuralq.rules.semi_markov import smdp_discount
 from neuralq.rules.slopes import input_slopes, lob_star, return_slopes, squared_slopes
 from neuralq.rules.target_rule import Followed, Option, Seen, TargetRule, target_rules
 from neuralq.rules.targets import (
@@ -85,6 +86,7 @@ __all__ = [
     "sample",
     "sarsa",
     "semi_gradient_error",
+    "smdp_discount",
     "soft_value",
     "softmax",
     "squared",

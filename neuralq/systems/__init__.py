@@ -34,6 +34,10 @@ SYSTEMS = {
     "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic"),
     "checkers": SystemEntry("neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote"),
     "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen"),
+    "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop"),
+    "job-shop": SystemEntry(
+        "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
+    ),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
 }

@@ -28,6 +28,7 @@ from neuralq.tabular.kernels.bits import (
     bits_remembered,
 )
 from neuralq.tabular.kernels.random_numbers import new_stream
+from neuralq.tabular.kernels.semi_markov import smdp_q_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
@@ -101,6 +102,7 @@ __all__ = [
     "robbins_monro_sums",
     "sarsa",
     "sarsa_lambda",
+    "smdp_q_update",
     "sweep_errors",
     "td_lambda",
     "under_policy",

@@ -5,6 +5,6 @@
 
 from __future__ import annotations
 
-from neuralq_envs.checkers.position import Move, Position
+from neuralq_envs.checkers.position import COLOURS, MOST_QUIET_PLIES, Move, Position
 
-__all__ = ["Move", "Position"]
+__all__ = ["COLOURS", "MOST_QUIET_PLIES", "Move", "Position"]

@@ -10,9 +10,11 @@ import numpy as np
 
 from neuralq_envs.checkers.rules import LAST_ROW, MAX_MOVES, SQUARES, START, moves, shifted, turned
 
-__all__ = ["COLOURS", "NUM_PIECES", "Move", "Position", "bit_of", "square_of"]
+__all__ = ["COLOURS", "MOST_QUIET_PLIES", "NUM_PIECES", "Move", "Position", "bit_of", "square_of"]
 
 NUM_PIECES = 12
+MOST_QUIET_PLIES = 60
+"""A game in which nothing was captured and no man moved for so many plies is a draw."""
 COLOURS = ("black", "white")
 """Black begins, from squares 1 to 12."""
 

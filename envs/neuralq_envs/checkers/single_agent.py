@@ -21,14 +21,12 @@ from numpy.typing import NDArray
 
 from neuralq.checks import check_choice, check_whole
 from neuralq_envs.checkers.drawing import pixels
-from neuralq_envs.checkers.position import COLOURS, Move, Position
+from neuralq_envs.checkers.position import COLOURS, MOST_QUIET_PLIES, Move, Position
 
-__all__ = ["MOST_QUIET_PLIES", "CheckersEnv", "make"]
+__all__ = ["CheckersEnv", "make"]
 
 Opponent = Callable[[Position], Move]
 _RENDER_MODES = ("ansi", "rgb_array")
-MOST_QUIET_PLIES = 60
-"""A game in which nothing was captured and no man moved for so many plies is a draw."""
 _NUM_SQUARES = 32
 
 

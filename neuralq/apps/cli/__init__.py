@@ -74,7 +74,7 @@ COMMANDS = {
     "solve": _of("exact", "solve", "compute the exact answer of an environment with a model", _EXACT),
     "chapter": _of("chapter", "chapter", "run the figures, exercises and systems of Mitchell's chapter 13", _EXACT),
     "demo": _of("demo", "demo", "learn CartPole, predict a divergence, write a page about both", _PLAY),
-    "play": _of("play", "play", "play backgammon against a trained agent, or tic-tac-toe, in the browser", _PLAY),
+    "play": _of("play", "play", "play backgammon, checkers or tic-tac-toe in the browser", _PLAY),
     "completion": _of("completion", "completion", "print a script that completes commands in your shell", _PLAY),
 }
 

@@ -17,6 +17,8 @@ from neuralq.doctor import CannotLoad, examine
 from neuralq.doctor.examination import LEVELS, NUM_PARTS
 from neuralq.doctor.probes import probe as run_probes
 from neuralq.runs.folder.run_folder import is_run_folder
+from neuralq.runs.sweep import is_sweep_folder, open_sweep
+from neuralq.runs.trust import refuse_strangers
 
 __all__ = ["doctor", "examined", "probe"]
 
@@ -24,8 +26,8 @@ __all__ = ["doctor", "examined", "probe"]
 _MINUTE, _MOMENT = 60.0, 4.0
 """Seconds for the doctor at the end of a run, where it was asked for, and where the target was not reached."""
 _SUBJECT = (
-    "a neuralq run folder; a zip of Stable-Baselines3 (DQN) or sb3-contrib (QR-DQN); a .cleanrl_model; a state dict "
-    "(.pth, .safetensors, .npz)"
+    "a neuralq run folder, or a sweep's, whose worst seed is examined; a zip of Stable-Baselines3 (DQN) or "
+    "sb3-contrib (QR-DQN); a .cleanrl_model; a state dict (.pth, .safetensors, .npz)"
 )
 
 
@@ -34,6 +36,8 @@ def doctor(argv: list[str]) -> int:
     options = _parser().parse_args(argv)
     if is_run_folder(options.subject):
         single_run(options.subject, options.trust)
+    elif is_sweep_folder(options.subject) and options.trust == "false":
+        refuse_strangers(open_sweep(options.subject).config)
     with ProgressBar[tuple[int, str]](
         NUM_PARTS, lambda told: Told(told[0], [told[1]], f"{told[0]} of {NUM_PARTS}")
     ) as bar:

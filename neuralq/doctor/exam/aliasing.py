@@ -4,22 +4,26 @@ Where an observation is a state, the step before it adds nothing. The gain
 
     max_j  R²(Δo_j or r | o, a, o⁻, a⁻) − R²(the same | o, a)
 
-of regressions held out by episode is above zero where something that matters is hidden, as velocities are.
+of regressions held out by episode is above zero where something that matters is hidden, as velocities are. Beside it
+stands, as evidence and no more, how far TD(0) and Monte Carlo disagree on values of the random policy, which they do
+not where observations are states and the features can tell them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from neuralq.doctor.estimates import held_out_r2
+from neuralq.doctor.estimates import held_out_r2, td_against_monte_carlo
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.findings import Finding
+from neuralq.doctor.play import returns_from
 from neuralq.types import Array, Floats
 
 __all__ = ["aliasing"]
 
 _MOST_ROWS, _MOST_WIDTH, _FEWEST_EPISODES = 4000, 200, 8
 _THRESHOLD = 0.10
+_SHORT = 0.9
 
 
 def aliasing(case: Case) -> Finding:
@@ -39,6 +43,7 @@ def aliasing(case: Case) -> Finding:
     said = (
         f"the step before tells {100 * max(gain, 0):.0f} % more of the variance of {what} than the observation alone: "
         + ("something that matters is hidden" if low > _THRESHOLD else "nothing that matters is hidden")
+        + _second_opinion(case)
     )
     return Finding(
         "E6", "observations hide part of the state", "environment", "B", gain, (low, high), _THRESHOLD,
@@ -47,6 +52,21 @@ def aliasing(case: Case) -> Finding:
         "env = gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FrameStackObservation(env, 2))  # and train "
         "again",
     )  # fmt: skip
+
+
+def _second_opinion(case: Case) -> str:
+    """What TD(0) and Monte Carlo say of the random policy, at a discount whose returns are soon known."""
+    gamma, rows = min(case.gamma, _SHORT), []
+    for one in case.chance:
+        g = returns_from(one, gamma, 0.05)
+        n = len(g)
+        o = case.world.as_rows(one.observations[: n + 1])
+        rows.append((o[:n], one.rewards[:n], o[1:], np.arange(n) == (one.length - 1 if one.terminated else -1), g))
+    x, r, x_t, ended, g = (np.concatenate(part)[:_MOST_ROWS] for part in zip(*rows, strict=True))
+    if len(g) < 100 or g.std() == 0:
+        return ""
+    apart = td_against_monte_carlo(x, r, x_t, ended, g, gamma, case.rng(606))
+    return f"; TD(0) and Monte Carlo differ by {100 * apart:.2g} % of the spread of returns of random play"
 
 
 def _rows(case: Case) -> tuple[Floats, Floats, Floats, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
 
-__all__ = ["CannotMeasure", "Case", "begin", "seen_at", "stacked"]
+__all__ = ["CannotMeasure", "Case", "any_of", "begin", "greedy_of", "legal_at", "seen_at", "stacked"]
 
 NUM_GREEDY, NUM_EXPLORED, NUM_OTHER = 100, 30, 30
 _EPSILON = 0.1
@@ -80,10 +81,11 @@ class Case:
         """Steps after which 95 % of a constant stream's value has come in."""
         return horizon(self.gamma)
 
-    def visited(self, num: int, number: int) -> Array:
-        """Observations that its policy meets (greedy and explored), ``[≤ num, *obs]``."""
+    def visited(self, num: int, number: int) -> tuple[Array, Array | None]:
+        """Observations that its policy meets (greedy and explored), ``[≤ num, *obs]``, and their legal actions."""
         pool = [*self.greedy, *self.explored]
-        return seen_at(pool, self.rng(number).permutation(sum(one.length for one in pool))[:num])
+        steps = self.rng(number).permutation(sum(one.length for one in pool))[:num]
+        return seen_at(pool, steps), legal_at(pool, steps)
 
 
 Measurement = Callable[[Case], "Finding | Sequence[Finding]"]
@@ -95,6 +97,34 @@ def seen_at(episodes: Sequence[Episode], steps: Indices, later: int = 0) -> Arra
     which = np.searchsorted(begins, steps, side="right") - 1
     rows = [episodes[i].observations[t - begins[i] + later] for i, t in zip(which, steps, strict=True)]
     return np.stack(rows)
+
+
+def greedy_of(values: Floats, legal: Array) -> Indices:
+    """The best of the legal actions, ``[N, A] -> [N]``; NaN is no value.
+
+    Example:
+        >>> greedy_of(np.array([[3.0, 1.0, np.nan]]), np.array([[False, True, True]])).tolist()
+        [1]
+    """
+    best: Indices = np.where(legal, np.nan_to_num(values, nan=-np.inf), -np.inf).argmax(1)
+    return best
+
+
+def any_of(legal: Array, rng: np.random.Generator) -> Indices:
+    """One of the legal actions of each row, all as likely: ``[N, A] -> [N]``."""
+    if legal.all():
+        return rng.integers(legal.shape[1], size=len(legal))
+    drawn: Indices = np.where(legal, rng.random(legal.shape), -1.0).argmax(1)
+    return drawn
+
+
+def legal_at(episodes: Sequence[Episode], steps: Indices, later: int = 0) -> Array | None:
+    """Which actions are legal at these steps, as `seen_at` has them: ``[n, A]``; None where no mask is given."""
+    if not episodes or episodes[0].legal is None:
+        return None
+    begins = np.cumsum([0, *(one.length for one in episodes)])
+    which = np.searchsorted(begins, steps, side="right") - 1
+    return np.stack([cast(Array, episodes[i].legal)[t - begins[i] + later] for i, t in zip(which, steps, strict=True)])
 
 
 def stacked(episodes: Sequence[Episode]) -> tuple[Array, Indices, Floats, Array, Array, Indices]:
@@ -117,20 +147,24 @@ def begin(
     num_actions, budget = world.num_actions, clock.budget_s
     past = 0 if gamma >= 1 else min(horizon(gamma, 0.01), _MOST_PAST)
 
-    def greedy(s: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
+    def greedy(s: Array, legal: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
         values = subject.values(s)
-        return np.nan_to_num(values, nan=-np.inf).argmax(1), values
+        return greedy_of(values, legal), values
 
-    def explored(s: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
-        best, values = greedy(s, rng)
+    def explored(s: Array, legal: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
+        best, values = greedy(s, legal, rng)
         chance = rng.random(len(s)) < _EPSILON
-        return np.where(chance, rng.integers(num_actions, size=len(s)), best), values
+        return np.where(chance, any_of(legal, rng), best), values
 
-    def chance(s: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
-        return rng.integers(num_actions, size=len(s)), np.full((len(s), num_actions), np.nan)
+    def chance(s: Array, legal: Array, rng: np.random.Generator) -> tuple[Indices, Floats]:
+        return any_of(legal, rng), np.full((len(s), num_actions), np.nan)
 
-    def always(a: int) -> Callable[[Array, np.random.Generator], tuple[Indices, Floats]]:
-        return lambda s, rng: (np.full(len(s), a), np.full((len(s), num_actions), np.nan))
+    def always(a: int) -> Callable[[Array, Array, np.random.Generator], tuple[Indices, Floats]]:
+        """This action, and a random one where it is illegal."""
+        return lambda s, legal, rng: (
+            np.where(legal[:, a], a, any_of(legal, rng)),
+            np.full((len(s), num_actions), np.nan),
+        )
 
     say("playing greedy episodes")
     best = play(world, greedy, NUM_GREEDY, seed, seconds=0.25 * budget, past_limit=past)

@@ -5,19 +5,22 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from neuralq.doctor.estimates import area_under_curve, held_out_scores
-from neuralq.doctor.exam.case import CannotMeasure, Case
+from neuralq.doctor.exam.case import CannotMeasure, Case, any_of
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Episode
+from neuralq.doctor.play import Episode, legal_in
 from neuralq.types import Floats
 
 __all__ = ["contract", "determinism", "disguised_limit", "observation_scale", "reward_scale"]
 
+_TIME_TO_IMPORT_S = 30.0
 _CONFIRM_CHECK = (
     "import gymnasium as gym\nfrom gymnasium.utils.env_checker import check_env\n"
     "check_env(gym.make({name!r}).unwrapped)"
@@ -26,14 +29,21 @@ _CONFIRM_CHECK = (
 
 def contract(case: Case) -> Finding:
     """E1: Gymnasium's checker, NaN, and observations outside their space."""
-    problem = _broken_numbers(case.episodes) or _outside(case) or _checked(case)
+    masked = case.greedy[0].legal is not None  # checkers try actions that are illegal
+    problem = _broken_numbers(case.episodes) or _outside(case) or (None if masked else _checked(case))
     return Finding(
         "E1", "the environment breaks its contract", "environment", "B", float(problem is not None), None, 0.5,
         "Gymnasium's contract: any fault counts", problem is not None,
-        problem or "Gymnasium's checker, and every number that was seen, found nothing",
+        problem or f"{_checkers(case)}, and every number that was seen, found nothing",
         "mend the environment first: whatever is learned from it is in doubt",
         _CONFIRM_CHECK.format(name=case.world.name),
     )  # fmt: skip
+
+
+def _checkers(case: Case) -> str:
+    if case.greedy[0].legal is not None:
+        return "what was played (checkers would try illegal actions)"
+    return "Gymnasium's checker" + (" and Stable-Baselines3's" if _second_checker(case) is not None else "")
 
 
 def _broken_numbers(episodes: Sequence[Episode]) -> str | None:
@@ -56,34 +66,55 @@ def _outside(case: Case) -> str | None:
     return None
 
 
+def _second_checker(case: Case) -> Callable[..., None] | None:
+    """Stable-Baselines3's, where it is installed and there is time to import it."""
+    if case.clock.budget_s < _TIME_TO_IMPORT_S:
+        return None
+    try:
+        from stable_baselines3.common.env_checker import check_env as found
+    except ImportError:
+        return None
+    return cast(Callable[..., None], found)
+
+
 def _checked(case: Case) -> str | None:
     env = case.world.make()
+    asked = "Gymnasium's"
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
+            if (second := _second_checker(case)) is not None and _takes(env.unwrapped):
+                asked = "Stable-Baselines3's"
+                second(env.unwrapped, warn=False, skip_render_check=True)
     except Exception as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return f"Gymnasium's check_env says: {first[:200]}"
+        return f"{asked} check_env says: {(str(error) or type(error).__name__).splitlines()[0][:200]}"
     finally:
         env.close()
     return None
 
 
+def _takes(env: Any) -> bool:
+    """Whether Stable-Baselines3 has such spaces: it refuses others, which says nothing against the environment."""
+    space, actions = env.observation_space, env.action_space
+    return isinstance(space, spaces.Box) or (isinstance(space, spaces.Discrete) and space.start == actions.start == 0)
+
+
 def determinism(case: Case) -> Finding:
     """E2: the same seed and the same 200 actions must do the same, bit for bit."""
-    world, rng = case.world, case.rng(2)
-    actions = rng.integers(world.num_actions, size=200) + world.first_action
-    seen = []
+    world, seen = case.world, []
     for _ in range(2):
-        env = world.make()
+        env, rng = world.make(), case.rng(2)
         try:
-            trace = [np.asarray(env.reset(seed=case.seed)[0]).tobytes()]
-            for a in actions.tolist():
-                s, r, terminated, truncated, _ = env.step(a)
+            s, info = env.reset(seed=case.seed)
+            trace = [np.asarray(s).tobytes()]
+            for _ in range(200):
+                a = int(any_of(legal_in(info, world.num_actions)[None], rng)[0])
+                s, r, terminated, truncated, info = env.step(a + world.first_action)
                 trace += [np.asarray(s).tobytes(), np.float64(r).tobytes()]
                 if terminated or truncated:
-                    trace.append(np.asarray(env.reset()[0]).tobytes())
+                    s, info = env.reset()
+                    trace.append(np.asarray(s).tobytes())
         finally:
             env.close()
         seen.append(trace)

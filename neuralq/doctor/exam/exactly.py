@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from neuralq.doctor.exam.case import CannotMeasure, Case
@@ -20,7 +22,7 @@ def regret(case: Case) -> Finding:
     """V7: what the greedy policy loses from the start, over the span of the optimal values; exact."""
     model, values = _values(case)
     best = solve(model, case.gamma)
-    greedy = np.where(model.legal, values, -np.inf).argmax(1)
+    greedy = np.where(_legal(case, model), values, -np.inf).argmax(1)
     v = evaluate(model, np.where(model.is_terminal, -1, greedy), case.gamma)
     start = model.start_distribution
     lost = float(start @ (best.v - v))
@@ -43,7 +45,7 @@ def against_optimum(case: Case) -> Finding:
     met = np.zeros(model.num_states, bool)
     for one in (*case.greedy, *case.explored):
         met[_states(case, one.observations)] = True
-    rows = (model.legal & met[:, None]) & ~model.is_terminal[:, None]
+    rows = (_legal(case, model) & met[:, None]) & ~model.is_terminal[:, None]
     if not rows.any():
         raise CannotMeasure("no state of the model was met")
     errors = np.abs(values - np.nan_to_num(best.q))[rows]
@@ -67,6 +69,25 @@ def _values(case: Case) -> tuple[FiniteMDP, np.ndarray[tuple[int, ...], np.dtype
     if seen is None or (case.world.is_discrete and int(space.n) != model.num_states):  # type: ignore[attr-defined]
         raise CannotMeasure("what the states of the model look like is not known")
     return model, case.subject.values(seen)
+
+
+def _legal(case: Case, model: FiniteMDP) -> Array:
+    """The model's legal actions, less those that masks forbid: where a state was met, or the environment says it."""
+    legal = model.legal.copy()
+    if case.greedy[0].legal is None:
+        return legal
+    env = case.world.make()
+    asked = getattr(env.unwrapped, "action_mask", None)  # as Taxi has it
+    if callable(asked) and case.world.is_discrete:
+        legal &= np.stack([np.asarray(asked(s)) != 0 for s in range(model.num_states)])
+    env.close()
+    met: dict[bytes, Array] = {}
+    for one in case.episodes:
+        seen = one.observations.astype(cast(Array, case.world.seen_as).dtype)
+        met |= {s.tobytes(): mask for s, mask in zip(seen, one.legal if one.legal is not None else (), strict=False)}
+    for state, looks in enumerate(cast(Array, case.world.seen_as)):
+        legal[state] &= met.get(looks.tobytes(), True)
+    return np.where(legal.any(1, keepdims=True), legal, model.legal)
 
 
 def _states(case: Case, observations: Array) -> Indices:

@@ -126,7 +126,7 @@ def _residual(rows: Floats, alpha: float, beta: float) -> float:
 def _steps(one: Episode) -> Floats:
     """r, max Q(s', ·) (0 past the end of the world) and Q(s, a), ``[T', 3]``."""
     n = one.length if one.terminated else one.length - 1
-    ahead = np.append(one.values[1:].max(1), 0.0)
+    ahead = np.append(one.legal_values[1:].max(1), 0.0)
     return np.column_stack([one.rewards, ahead, one.values[np.arange(one.length), one.actions]])[:n]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuralq.doctor.exam.case import CannotMeasure, Case, seen_at
+from neuralq.doctor.exam.case import CannotMeasure, Case, legal_at, seen_at
 from neuralq.doctor.exam.signs import (
     NUM_FRESH,
     Outputs,
@@ -26,12 +27,12 @@ from neuralq.doctor.exam.signs import (
 from neuralq.doctor.findings import Finding
 from neuralq.lab.networks.sampled import SampleDiagnosis, diagnose_sample
 from neuralq.lab.watch.advice import RunTraits, advise
-from neuralq.types import Floats, Transition
+from neuralq.types import Array, Floats, Transition
 
 __all__ = ["churn", "dormant", "effective_rank", "kernel", "lag", "plasticity", "untouched"]
 
 _NUM_STATES = 512
-_MOST_WEIGHTS = 5_000_000
+_MOST_WEIGHTS, _FEW_WEIGHTS = 5_000_000, 20_000
 
 
 def _network(case: Case) -> tuple[nn.Module, Outputs]:
@@ -42,8 +43,29 @@ def _network(case: Case) -> tuple[nn.Module, Outputs]:
 
 def _encoded(case: Case, num: int, number: int) -> Tensor:
     assert case.subject.encode is not None
-    seen = case.visited(num, number)
+    seen, _ = case.visited(num, number)
     return case.subject.encode(seen if seen.ndim < 4 else seen[:128])
+
+
+def _with_mask(case: Case, observations: Array, legal: Array | None) -> Tensor:
+    """What the network takes, and behind it which actions are legal, if there are masks."""
+    assert case.subject.encode is not None
+    x = case.subject.encode(observations)
+    return x if legal is None else torch.cat([x.reshape(len(x), -1), torch.as_tensor(legal).to(x.dtype)], dim=1)
+
+
+def _legal_only(case: Case, outputs: Outputs) -> Outputs:
+    """The outputs for what `_with_mask` gives, −∞ for illegal actions."""
+    if case.greedy[0].legal is None:
+        return outputs
+    assert case.subject.encode is not None
+    shape = case.subject.encode(case.greedy[0].observations[:1]).shape[1:]
+
+    def legal(network: nn.Module, x: Tensor) -> Tensor:
+        seen, mask = x[..., : -case.world.num_actions], x[..., -case.world.num_actions :]
+        return outputs(network, seen.reshape(*x.shape[:-1], *shape)).masked_fill(mask == 0, -torch.inf)
+
+    return legal
 
 
 def _fresh_ones(network: nn.Module, rng: np.random.Generator) -> Iterator[nn.Module]:
@@ -98,14 +120,13 @@ class _Values(nn.Module):
 
 
 def _transitions(case: Case, num: int, number: int) -> Transition:
-    assert case.subject.encode is not None
     pool = [*case.greedy, *case.explored]
     a, r = (np.concatenate([getattr(one, name) for one in pool]) for name in ("actions", "rewards"))
     ended = np.concatenate([np.arange(one.length) == (one.length - 1 if one.terminated else -1) for one in pool])
     pick = case.rng(number).permutation(len(r))[:num]
     scale = case.settings.reward_scale or 1.0
     discount = np.where(ended[pick], 0.0, case.gamma)
-    now, ahead = (case.subject.encode(seen_at(pool, pick, later)) for later in (0, 1))
+    now, ahead = (_with_mask(case, seen_at(pool, pick, k), legal_at(pool, pick, k)) for k in (0, 1))
     return Transition(
         now, torch.as_tensor(a[pick]), torch.ones(len(pick)),
         torch.as_tensor(scale * r[pick]).float(), torch.as_tensor(discount).float(), ahead,
@@ -123,9 +144,13 @@ def kernel(case: Case) -> Finding:
     rate = case.settings.learning_rate or 1e-4
 
     def diagnosed(one: nn.Module) -> SampleDiagnosis:
-        return diagnose_sample(cast(Any, _Values(one, outputs, case.world.num_actions)), step, rate)
+        return diagnose_sample(cast(Any, _Values(one, _legal_only(case, outputs), case.world.num_actions)), step, rate)
 
     found = diagnosed(copy.deepcopy(network))
+    others: list[float] = []
+    if weights <= _FEW_WEIGHTS and case.clock.left > 0.3 * case.clock.budget_s:
+        with contextlib.suppress(CannotMeasure):
+            others = [diagnosed(one).min_real_eigenvalue for one in _fresh_ones(network, case.rng(34))]
     period = case.settings.target_period_updates
     traits = RunTraits(
         gamma=case.gamma, step_size=rate, target_period=None if period is None or period <= 1 else max(int(period), 1)
@@ -134,15 +159,19 @@ def kernel(case: Case) -> Finding:
         "R3", "one-step updates make errors grow from here", "algorithm", "C", found.min_real_eigenvalue, None, 0.0,
         "the sign of the kernel's smallest eigenvalue beyond the noise of a sample (Yue et al. 2023)", found.unstable,
         found.explain(), "; ".join(advise(traits, found)[:3]), "neuralq lab prescribe baird  # what each remedy does",
+        fresh=tuple(others),
     )  # fmt: skip
 
 
 def churn(case: Case) -> Finding:
     """R4: in which share of other states the greedy action changes by one Adam step (Schaul et al. 2022)."""
-    (network, outputs), x = _network(case), _encoded(case, _NUM_STATES, 26)
+    (network, every), seen = _network(case), case.visited(_NUM_STATES, 26)
+    outputs, x = _legal_only(case, every), _with_mask(case, *seen)[: 512 if seen[0].ndim < 4 else 128]
     step, rate = _transitions(case, 32, 27), case.settings.learning_rate or 1e-4
     share, change = moved(network, outputs, step, rate, x)
-    others = [moved(one, outputs, step, rate, x)[0] for one in _fresh_ones(network, case.rng(33))]
+    others: list[float] = []
+    with contextlib.suppress(CannotMeasure):
+        others = [moved(one, outputs, step, rate, x)[0] for one in _fresh_ones(network, case.rng(33))]
     return Finding(
         "R4", "one update changes the policy elsewhere", "algorithm", "C", share, None, 0.1, "our own", share > 0.1,
         f"one Adam step of size {rate:g} on 32 transitions changes the greedy action in {100 * share:.2g} % of "

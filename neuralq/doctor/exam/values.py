@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from neuralq.doctor.estimates import bounds_of, rank_correlation
-from neuralq.doctor.exam.case import CannotMeasure, Case, stacked
+from neuralq.doctor.exam.case import CannotMeasure, Case, any_of, greedy_of, stacked
 from neuralq.doctor.exam.retraining import further_reach, in_words, retrained
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Episode, returns_from
+from neuralq.doctor.play import Episode, legal_in, returns_from
 from neuralq.types import Array, Floats
 
 __all__ = ["better_actions", "bias", "generalisation", "has_learned", "rank", "reach", "soft_divergence"]
@@ -94,7 +94,8 @@ def bias(case: Case) -> Finding:
 
 def soft_divergence(case: Case) -> Finding:
     """V4: max |Q| over what any return can be (van Hasselt et al. 2018)."""
-    values = np.concatenate([one.values for one in (*case.greedy, *case.explored)])
+    pool = [*case.greedy, *case.explored]
+    values = np.concatenate([one.values[... if one.legal is None else one.legal[:-1]].reshape(-1) for one in pool])
     if not np.isfinite(values).all():
         return Finding(
             "V4", "values are not finite", "algorithm", "B", float("nan"), None, 1.1, "any", True,
@@ -211,47 +212,51 @@ def better_actions(case: Case) -> Finding:
 _NUM_STATES, _REPEATS, _MOST_AHEAD = 24, 3, 300
 
 
-def _snapshots(case: Case) -> list[tuple[object, Array]]:
+def _snapshots(case: Case) -> list[tuple[object, Array, Array]]:
     rng, world = case.rng(16), case.world
     lengths = [one.length for one in case.explored]
-    found: list[tuple[object, Array]] = []
+    found: list[tuple[object, Array, Array]] = []
     for i in range(_NUM_STATES):
         env = world.make()
-        s, _ = env.reset(seed=5000 + i)
+        s, info = env.reset(seed=5000 + i)
         for _ in range(int(rng.integers(0, max(int(np.median(lengths)) // 2, 1)))):
-            a = int(case.subject.values(np.asarray(s)[None])[0].argmax())
-            a = int(rng.integers(world.num_actions)) if rng.random() < 0.1 else a
-            s, _, terminated, truncated, _ = env.step(a + world.first_action)
+            legal = legal_in(info, world.num_actions)[None]
+            a = int(greedy_of(case.subject.values(np.asarray(s)[None]), legal)[0])
+            a = int(any_of(legal, rng)[0]) if rng.random() < 0.1 else a
+            s, _, terminated, truncated, info = env.step(a + world.first_action)
             if terminated or truncated:
-                s, _ = env.reset()
+                s, info = env.reset()
         try:
             copy.deepcopy(env)
         except Exception as error:
             raise CannotMeasure(f"the environment cannot be copied ({type(error).__name__})") from error
-        found.append((env, np.asarray(s)))
+        found.append((env, np.asarray(s), legal_in(info, world.num_actions)))
     return found
 
 
-def _gains(case: Case, states: list[tuple[object, Array]]) -> Floats:
-    """Discounted return of every action beside that of the greedy one, ``[states, actions, repeats]``."""
+def _gains(case: Case, states: list[tuple[object, Array, Array]]) -> Floats:
+    """Discounted return of every action beside that of the greedy one, ``[states, actions, repeats]``; 0 if illegal."""
     world, num = case.world, case.world.num_actions
-    greedy = case.subject.values(np.stack([s for _, s in states])).argmax(1)
+    legal = np.stack([mask for _, _, mask in states])
+    greedy = greedy_of(case.subject.values(np.stack([s for _, s, _ in states])), legal)
     envs, seen, total = [], [], np.zeros((len(states), num, _REPEATS))
-    for env, s in states:
+    for env, s, _ in states:
         for _ in range(num):
             for j in range(_REPEATS):
                 one = copy.deepcopy(env)
                 one.unwrapped.np_random = np.random.default_rng(j)  # type: ignore[attr-defined]
                 envs.append(one)
                 seen.append(s)
-    flat, going = total.reshape(-1), list(range(len(envs)))
+    allowed = np.repeat(legal, num * _REPEATS, axis=0)  # in what follows
+    flat, going = total.reshape(-1), np.flatnonzero(np.repeat(legal.reshape(-1), _REPEATS)).tolist()
     actions = np.tile(np.repeat(np.arange(num), _REPEATS), len(states))
     for t in range(min(_MOST_AHEAD, case.horizon)):
         if t:
-            actions[going] = case.subject.values(np.stack([seen[i] for i in going])).argmax(1)
+            actions[going] = greedy_of(case.subject.values(np.stack([seen[i] for i in going])), allowed[going])
         still = []
         for i in going:
-            seen[i], r, terminated, truncated, _ = envs[i].step(int(actions[i]) + world.first_action)  # type: ignore[attr-defined]
+            seen[i], r, terminated, truncated, info = envs[i].step(int(actions[i]) + world.first_action)  # type: ignore[attr-defined]
+            allowed[i] = legal_in(info, num)
             flat[i] += case.gamma**t * float(r)
             if not (terminated or truncated):
                 still.append(i)
@@ -259,7 +264,7 @@ def _gains(case: Case, states: list[tuple[object, Array]]) -> Floats:
         if not going or case.clock.left <= 0:
             break
     gains: Floats = total - total[np.arange(len(states)), greedy][:, None, :]
-    return gains
+    return np.where(legal[:, :, None], gains, 0.0)
 
 
 def generalisation(case: Case) -> Finding:

@@ -15,6 +15,7 @@ from neuralq.doctor.origins.record import Origin
 from neuralq.doctor.origins.stored_replay import rescaled, stored_replay
 from neuralq.doctor.subject import Settings, Subject, of_network
 from neuralq.doctor.weights import CannotLoad
+from neuralq.q import MaskedQ
 from neuralq.runs import load
 from neuralq.runs.agent import Agent
 from neuralq.runs.folder.run_folder import is_run_folder, read_config, read_metrics
@@ -41,10 +42,11 @@ def of_agent(agent: Agent) -> Subject:
     """The subject that an agent of neuralq is, with what the folder of its run says.
 
     Raises:
-        CannotLoad: its observations carry an action mask.
+        CannotLoad: there are action masks, and they are not around its values but inside.
     """
-    if agent.spec.masked:
-        raise CannotLoad("agents whose observations carry an action mask are not examined yet")
+    network = agent.q.inner if isinstance(agent.q, MaskedQ) else agent.q
+    if agent.spec.masked and network is agent.q:
+        raise CannotLoad(f"a {type(agent.q).__name__} with action masks inside it is not taken apart")
 
     def encode(observations: Array) -> Tensor:
         composite = bool(agent.encoder.parts[0].keys)  # which come flat
@@ -57,7 +59,7 @@ def of_agent(agent: Agent) -> Subject:
         given: Tensor = network.all(x)  # type: ignore[operator]
         return given
 
-    assert isinstance(agent.q, nn.Module)
+    assert isinstance(network, nn.Module)
     told: dict[str, Any] = {"settings": Settings(reward_scale=agent.reward_scale)}
     origin, path, replay = "an agent of neuralq", agent.run_dir, None
     if path is not None and is_run_folder(path):
@@ -69,7 +71,7 @@ def of_agent(agent: Agent) -> Subject:
         }
         replay = functools.partial(stored_replay, path, agent, config.gamma)
     subject = of_network(
-        agent.q, origin, encode=encode, outputs=outputs, num_actions=agent.spec.num_actions,
+        network, origin, encode=encode, outputs=outputs, num_actions=agent.spec.num_actions,
         first_action=agent.first_action, **told,
     )  # fmt: skip
     return replace(subject, replay=replay)

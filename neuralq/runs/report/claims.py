@@ -179,7 +179,8 @@ class Measured:
 
     def _said(self, value: float) -> str:
         beyond = self.limit is not None and value >= self.limit
-        return f"over {self.limit:,.4g}" if beyond else f"{value:,.4g}"
+        shown = self.limit if beyond and self.limit is not None else value
+        return ("over " if beyond else "") + (f"{shown:,.0f}" if abs(shown) >= 1000 else f"{shown:.4g}")
 
     def plain(self) -> dict[str, Any]:
         """Plain values, for JSON."""
