@@ -118,7 +118,10 @@ def test_bias_is_the_share_by_which_values_are_too_high(factor: float) -> None:
     found = values.bias(case)
     assert found.value == pytest.approx((factor - 1) * g.mean() / max(g.mean(), g.std()))
     assert found.flagged == (factor != 1.0)
-    assert factor == 1.0 or ("over" in found.title) == (factor > 1)
+    assert factor == 1.0 or ("over" in found.title) == (factor > 1) == ("--target-rule double" in found.confirm)
+    assert len(values.on_policy(case, case.greedy[:5])) == 5
+    with pytest.raises(CannotMeasure, match="4 episodes"):
+        values.on_policy(case, case.greedy[:4])
 
 
 def test_returns_go_past_a_limit_that_can_be_lifted() -> None:
@@ -141,6 +144,9 @@ def test_no_value_may_exceed_what_any_return_can_be() -> None:
     assert values.soft_divergence(right).value == pytest.approx(1.0)
     assert values.soft_divergence(wrong).value == pytest.approx(3.0)
     assert not values.soft_divergence(right).flagged and values.soft_divergence(wrong).flagged
+    assert values.soft_divergence(case_of(Counting, both(np.ones_like), gamma=0.0)).value == 1
+    with pytest.raises(CannotMeasure, match="no reward"):
+        values.soft_divergence(ending(np.ones_like, pays=lambda t, a: 0.0))
 
 
 # V1, V6a: an environment that pays for the action t mod 2.
@@ -229,6 +235,18 @@ def test_right_values_are_no_mistake_and_two_that_agree_are_not_told_apart() -> 
     assert not hypotheses.hypotheses(ending(lambda t: summed(t, lambda i: waves(i, 0)), pays=waves)).flagged
     flat = hypotheses.hypotheses(limited(lambda t: np.full(len(t), 2.0)))  # γ = 0.5, or a fifth of every reward
     assert not flat.flagged and "cannot tell" in flat.evidence
+
+
+def test_a_mistake_has_to_fit_clearly_better_and_lines_are_drawn_in_the_order_of_returns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = MISTAKES["no end of episodes in the target"]()
+    found = hypotheses.lines(case)
+    assert next(iter(found)) == "no end of episodes in the target" and len(found) == 2
+    line = found["no end of episodes in the target"]
+    assert (np.diff(line[:, 0]) > 0).all() and line[:, 1] == pytest.approx(np.full(20, 10.0))
+    monkeypatch.setattr(hypotheses, "_BETTER", 0.0)
+    assert not hypotheses.hypotheses(case).flagged
 
 
 def test_too_few_copies_are_not_taken_for_a_mistake() -> None:
@@ -591,6 +609,25 @@ def test_a_buffer_that_holds_too_little_is_named_with_and_without_the_data() -> 
         case_of(lambda: Counting(), both(lambda t: t), settings=Settings(capacity=n)) for n in (60.0, 6000.0)
     )
     assert stored.window(small).flagged and not stored.window(large).flagged
+
+
+def test_stored_actions_are_those_that_the_environment_names() -> None:
+    """Numbered from 3, and worth t and t + 100: read from another number they would be each other's, or none."""
+
+    class Shifted(gym.ActionWrapper[Any, Any, Any]):
+        def __init__(self) -> None:
+            super().__init__(Counting(ends=None, cuts=50))
+            self.action_space = spaces.Discrete(2, start=3)
+
+        def action(self, action: Any) -> int:
+            return int(action) - 3
+
+    rows = {**experience(), "reward": np.ones(600), "action": experience()["action"] + 3}
+    case = case_of(Shifted, lambda s: np.stack([s[:, 0], 100 + s[:, 0]], axis=1), data=rows)
+    s, a = rows["obs"][:, 0], rows["action"] - 3
+    errors = 1 + GAMMA * (101 + s) - (s + 100 * a)
+    got = values._td_error(case, *(case.stored[k] for k in ("obs", "action", "reward", "next_obs", "terminated")))  # type: ignore[index]
+    assert got == pytest.approx((errors**2).mean())
 
 
 def test_a_missing_column_is_named_with_the_line_that_writes_it() -> None:

@@ -123,6 +123,10 @@ def test_a_paused_building_goes_on_as_if_nothing_had_been() -> None:
         assert not (parts.boarded > second).any() and not (parts.arrival[parts.waiting.sum() :] < 0).any()
     assert np.array_equal(whole.boarded, parts.boarded) and advance(parts, 1e9) == ENDED
     assert advance(open_building(passengers), 0.0) == PAUSED
+    ties = open_building(MINI, 2, 6)
+    assert advance(ties, 0.0) == PAUSED and ties.waiting.tolist() == [0, 1, 2, 0, 1, 2]  # a second includes its moment
+    write_inputs(ties, advance(ties, np.inf), x := np.zeros(27))
+    assert x[-3:].tolist() == [0, 1, 1]  # on floor 1: of those who have waited equally long, the lowest floor
     rewind(parts)
     for ours, fresh in zip(parts, open_building(passengers), strict=True):
         assert np.array_equal(ours, fresh, equal_nan=True) or ours is parts.behind or ours.shape in ((10,), (4,))
@@ -224,6 +228,8 @@ def test_options_give_passengers_and_nonsense_is_refused() -> None:
     assert said["second"] == pytest.approx(2.9)
     with pytest.raises(ValueError, match="action must be 0"):
         env.step(2)
+    # Who comes at the very moment at which a car passes is seen: there is something further on.
+    assert env.reset(options={"passengers": [(0, 2), (2.9, 3)]})[1]["second"] == 1.45 + 1.45
     for passengers in ([(0, 4)], [(0, 0)]):
         with pytest.raises(ValueError, match="must wait on floors 1 to 3"):
             env.reset(options={"passengers": passengers})
