@@ -59,6 +59,12 @@ def fit_to_slopes(num_steps: int) -> None:
     fit_slopes(new_slope_net(2, 10, rng), s, rng.normal(size=20), slope, num_steps=num_steps)
 
 
+def obelix_behaviours(num_steps: int) -> None:
+    from neuralq.systems.obelix.lives import spend
+
+    spend(0, "behaviours", "table", num_steps=max(num_steps, 4))
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
@@ -97,6 +103,7 @@ WORK = {
     "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
     "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "job-shop": Work("6,000 episodes of repair, 51 tasks", job_shop, 6000, 20, most_seconds=5.0),
+    "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }
 

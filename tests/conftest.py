@@ -84,6 +84,7 @@ SYSTEMS = (
     "test_checkers_learning",
     "test_elevators",
     "test_job_shop",
+    "test_obelix",
 )
 FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
 

@@ -56,6 +56,15 @@ def test_the_search_is_alpha_beta_over_positions_and_a_memory_falsifies_nothing(
     for depth, plies in ((1, 12), (2, 45), (4, 30)):
         assert difference_from_alpha_beta(8, plies, depth) < 1e-12
     assert difference_of_remembered(6, 2, 3) < 1e-12
+    weights, none, desk, stream = MATERIAL_ONLY.copy(), new_memory(0), new_desk(), new_stream(0)
+    for start in positions_of_games(5, 8, seed=9):
+        board, junk = (start.own, start.other, start.kings), {}
+        for depth in (2, 3):  # of what is remembered of the positions after one ply
+            memory = new_memory(64)
+            for move in start.moves():
+                remember(memory, move.position.own, move.position.other, move.position.kings, depth, -7.5)
+            junk[depth] = search(*board, 4, weights, 0.01, memory, desk, stream)
+        assert junk == {2: search(*board, 4, weights, 0.01, none, desk, stream), 3: 7.5}
     memory = new_memory(64)
     for i in range(200):  # 56 of them find room
         remember(memory, 1 + i, 1 << 20, 0, 2, float(i))

@@ -37,7 +37,7 @@ def test_what_was_not_fitted_is_predicted_and_noise_is_not() -> None:
     predicted = held_out_scores(x, y, episode, np.random.default_rng(2))
     assert np.abs(predicted[:, 0] - y[:, 0]).mean() < 0.1 and predicted[:, 3] == pytest.approx(y[:, 3])
     r2 = held_out_r2(x, y, episode, np.random.default_rng(2))
-    assert r2[0] > 0.99 and r2[1] > 0.9 and r2[2] < 0.05 and r2[3] == 0
+    assert r2[0] > 0.99 and r2[1] > 0.9 and -0.6 < r2[2] < 0.05 and r2[3] == 0
 
 
 def test_a_whole_episode_is_held_out() -> None:

@@ -118,7 +118,10 @@ def test_bias_is_the_share_by_which_values_are_too_high(factor: float) -> None:
     found = values.bias(case)
     assert found.value == pytest.approx((factor - 1) * g.mean() / max(g.mean(), g.std()))
     assert found.flagged == (factor != 1.0)
-    assert factor == 1.0 or ("over" in found.title) == (factor > 1)
+    assert factor == 1.0 or ("over" in found.title) == (factor > 1) == ("--target-rule double" in found.confirm)
+    assert len(values.on_policy(case, case.greedy[:5])) == 5
+    with pytest.raises(CannotMeasure, match="4 episodes"):
+        values.on_policy(case, case.greedy[:4])
 
 
 def test_returns_go_past_a_limit_that_can_be_lifted() -> None:
@@ -141,6 +144,9 @@ def test_no_value_may_exceed_what_any_return_can_be() -> None:
     assert values.soft_divergence(right).value == pytest.approx(1.0)
     assert values.soft_divergence(wrong).value == pytest.approx(3.0)
     assert not values.soft_divergence(right).flagged and values.soft_divergence(wrong).flagged
+    assert values.soft_divergence(case_of(Counting, both(np.ones_like), gamma=0.0)).value == 1
+    with pytest.raises(CannotMeasure, match="no reward"):
+        values.soft_divergence(ending(np.ones_like, pays=lambda t, a: 0.0))
 
 
 # V1, V6a: an environment that pays for the action t mod 2.

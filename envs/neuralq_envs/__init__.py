@@ -61,6 +61,7 @@ WITHOUT_MODEL = {
     "neuralq/Elevators-v0": Registration("neuralq_envs.elevators.environment", has_vector=False),
     # The repairs of 51 tasks are 50, those of 164 are 400.
     "neuralq/JobShop-v0": Registration("neuralq_envs.job_shop.env", has_vector=False, max_episode_steps=1000),
+    "neuralq/Obelix-v0": Registration("neuralq_envs.obelix", has_vector=False, max_episode_steps=100),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
 }

@@ -38,6 +38,7 @@ SYSTEMS = {
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
     ),
+    "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
 }
 

@@ -18,6 +18,15 @@ from neuralq.tabular.engine import RunOptions
 from neuralq.tabular.episodes import apply_episodes, episodic_q_learning
 from neuralq.tabular.kernels.ase_ace import AseAce, AseAceRates, ase_ace_action, ase_ace_update, new_ase_ace
 from neuralq.tabular.kernels.backups import BackupRule, backup_update
+from neuralq.tabular.kernels.bits import (
+    BitMemory,
+    bit_clusters,
+    bit_hamming,
+    bit_table,
+    bit_update,
+    bit_values,
+    bits_remembered,
+)
 from neuralq.tabular.kernels.random_numbers import new_stream
 from neuralq.tabular.kernels.semi_markov import smdp_q_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
@@ -45,6 +54,7 @@ __all__ = [
     "Backup",
     "BackupRule",
     "Band",
+    "BitMemory",
     "Curve",
     "EpsilonGreedy",
     "Experience",
@@ -68,6 +78,12 @@ __all__ = [
     "ase_ace_update",
     "backup_update",
     "batch_td",
+    "bit_clusters",
+    "bit_hamming",
+    "bit_table",
+    "bit_update",
+    "bit_values",
+    "bits_remembered",
     "compile_model",
     "double_q",
     "dyna_q",

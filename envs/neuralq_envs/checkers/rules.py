@@ -121,7 +121,10 @@ def _write(
 
 @lean_kernel
 def _write_jumps(own: int, other: int, kings: int, source: int, out: NDArray[np.int64], count: int) -> int:
-    """Every path of captures of one piece, depth first; the path itself is the stack."""
+    """Every path of captures of one piece, depth first; the path itself is the stack.
+
+    A man moves upwards until its move ends, so one that is crowned goes no further.
+    """
     empty = (SQUARES & ~(own | other)) | source
     num_directions = 4 if kings & source else 2
     at, taken, path, depth, direction, went_on = source, 0, 1, 0, 0, 0
@@ -136,9 +139,7 @@ def _write_jumps(own: int, other: int, kings: int, source: int, out: NDArray[np.
             went_on |= 1 << depth
             depth += 1
             went_on &= ~(1 << depth)
-            at, taken, path = target, taken | jumped, path << 2 | direction
-            # A man that is crowned goes no further.
-            direction = 4 if num_directions == 2 and at & LAST_ROW else 0
+            at, taken, path, direction = target, taken | jumped, path << 2 | direction, 0
             continue
         if depth == 0:
             return count

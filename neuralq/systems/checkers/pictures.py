@@ -30,12 +30,10 @@ def board_picture(weights: NDArray[np.float64], depth: int = 7) -> Picture:
     """A board with an arrow for each move, and what a search with these weights says of it."""
     position = Position.from_fen(SHOWN)
     ranked = CheckersPlayer(weights, depth, seed=0).ranked(position)
-    said = ", ".join(f"{one.move} {one.score:+.2f}" for one in ranked)
+    said = ", ".join(f"{one.move} {_signed(one.score)}" for one in ranked)
     caption = (
-        f"{'White' if position.turn else 'Black'} to move. On each move what a search of {depth} plies says of it, in "
-        "men, by the learned weights; "
-        "the best in yellow. By the count of pieces alone both sides are equal: "
-        f"{said}."
+        f"{'White' if position.turn else 'Black'} to move, pieces being equal. On each move what a search of {depth} "
+        f"plies says of it, in men, by the learned weights; the best in yellow. {said}."
     )
     return Picture("What the search says of every move", board_svg(position, ranked), caption)
 
@@ -71,6 +69,10 @@ def board_svg(position: Position, ranked: Sequence[RankedMove]) -> str:
     return "\n".join([*parts, "</svg>"])
 
 
+def _signed(score: float) -> str:
+    return f"{score:+.2f}".replace("-", "−")
+
+
 def _middle(square: int) -> tuple[float, float]:
     row, i = divmod(square - 1, 4)
     return (2 * i + 1.5 - row % 2) * _SIZE, (row + 0.5) * _SIZE
@@ -88,7 +90,7 @@ def _arrow(one: RankedMove, is_best: bool) -> list[str]:
     return [
         f'<polyline points="{way}" fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"/>',
         f'<rect x="{x - 21:g}" y="{y - 9:g}" width="42" height="18" rx="5" fill="{colour}"/>',
-        f'<text x="{x:g}" y="{y + 5:g}" font-size="13" fill="#1b1f24">{one.score:+.2f}</text>',
+        f'<text x="{x:g}" y="{y + 5:g}" font-size="13" fill="#1b1f24">{_signed(one.score)}</text>',
     ]
 
 
