@@ -123,6 +123,7 @@ def test_passengers_come_as_often_as_they_are_expected() -> None:
     within = np.concatenate([hour.arrival for hour in hours]) % 300
     assert np.histogram(within, bins=10, range=(0, 300))[0].std() < 5 * math.sqrt(len(within) / 10)
     assert all((np.diff(hour.arrival) >= 0).all() for hour in hours)
+    assert abs(np.corrcoef(arrival % 300, origin)[0, 1]) < 0.02  # no floor comes before another
 
 
 @pytest.mark.parametrize(
