@@ -153,6 +153,8 @@ def test_a_span_that_falls_no_more_is_waited_for_twenty_times() -> None:
     assert not any(constant.settles(v, 1.0, 1.0 + 2**-20, last=False) for _ in range(21))
     assert not constant.settles(v, 1.0, 1.0 + 2**-20, last=False)  # it stalls: the constant is taken out
     assert v[0] > 1e5 and constant._progress._patience == 20
+    more = next(n for n in range(1, 1000) if constant.settles(v, 1.0, 1.0 + 2**-20, last=False))
+    assert more == 4 * 22  # it is taken out four times, and then no more
 
 
 def test_an_evaluation_by_sweeps_looks_at_its_policy_again_after_two_hundred() -> None:

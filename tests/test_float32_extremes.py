@@ -47,6 +47,10 @@ def test_a_norm_whose_squares_overflow_or_vanish_is_taken_all_the_same(clip: Any
         g = torch.tensor(grad)
         clip(g, most)
         assert g.tolist() == pytest.approx(right, rel=1e-6)
+    for size, most in ((1e200, 10.0), (1e-200, 1e-201)):
+        g = torch.tensor([3 * size, 4 * size], dtype=torch.float64)
+        clip(g, most)
+        assert g.tolist() == pytest.approx([0.6 * most, 0.8 * most], rel=1e-12)
     for nothing in (math.inf, math.nan):
         g = torch.tensor([1.0, nothing])
         clip(g, 1.0)
