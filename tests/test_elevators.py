@@ -372,6 +372,24 @@ def test_rules_of_thumb_do_what_they_say() -> None:
     assert (0, 1, False) in top_first and (0, 2, True) in top_first
 
 
+def test_calls_belong_to_sectors_or_to_the_car_with_the_fewest_floors_to_go() -> None:
+    whole = open_building(hour_of(0, 10, 1.0))
+    assert [int(controllers._sector(whole, f)) for f in range(1, 10)] == [0, 0, 0, 1, 1, 2, 2, 3, 3]
+    b = open_building(MINI, 4, 6)
+    b.floor[:], b.phase[:], b.direction[:], b.aboard[:] = [3, 3, 3, 2], [0, 2, 2, 2], [1, 1, -1, 1], [0, 0, 2, 0]
+    assert [[int(controllers._floors_to_go(b, c, f)) for f in range(6)] for c in range(4)] == [
+        [3, 2, 1, 0, 1, 2],  # parked
+        [7, 6, 5, 0, 1, 2],  # on its way up, it turns at the top
+        [3, 2, 1, 0, 7, 8],  # on its way down, at the lobby
+        [8, 7, 0, 1, 2, 3],
+    ]
+    mini, controller = open_building(MINI, 2, 6), new_controller(controllers.NEAREST, 2, 6)
+    assert advance(mini, np.inf) == 0  # it is at floor 1, the other still on its way there
+    controllers._assign(mini, controller)
+    # Floor 1: 0 against 1. Floor 2: 1 + 1 against 2. Floor 4: 3 + 2 against 4. Floor 5: 4 + 2 against 5 + 1.
+    assert controller.owner[[1, 2, 4, 5]].tolist() == [0, 0, 1, 0] and controller.owned.tolist() == [-1, 5, 3, -1, 2, 0]
+
+
 def test_a_film_shows_cars_where_they_are_and_people_as_long_as_they_wait() -> None:
     passengers = given_passengers([(0, 3), (4, 2), (70, 9)])
     scene = record("three", new_controller(controllers.LQF), passengers, 2.0, 90.0)
