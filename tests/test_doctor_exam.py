@@ -464,10 +464,14 @@ def test_plasticity_of_a_fresh_network_is_that_of_a_fresh_network() -> None:
     assert network.plasticity(case_of(noisy, net)).flagged  # no unit of it can move any more
 
 
-def test_a_network_that_is_too_small_is_told_from_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Returns rise, fall and rise again along an episode, and one unit bends a line once."""
-    for name, number in (("_NUM_STEPS", 60), ("_SEEDS", 4)):
-        monkeypatch.setattr(capacity, name, number)
+@pytest.mark.parametrize("trains", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_network_that_is_too_small_is_told_from_one_that_is_not(
+    trains: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Returns rise, fall and rise again along an episode, and one unit bends a line once, however it is trained."""
+    monkeypatch.setattr(capacity, "_SEEDS", 4)
+    if not trains:
+        monkeypatch.setattr(capacity, "regressed", lambda *given: 0.2)
 
     def waving() -> gym.Env[Any, Any]:
         return Counting(pays=lambda t, a: 3 * math.cos(t / 3), shows=lambda t, rng: [t / 15 - 1, 0.0])
