@@ -84,7 +84,7 @@ def test_the_compiled_descent_is_pytorchs_adam() -> None:
     s, slope = rng.normal(size=(2, 6, 2))
     y, weight = rng.normal(size=6), rng.uniform(size=6)
     ours = fit_slopes(net, s, y, slope, weight, num_steps=40, step_size=0.05)
-    module, states = oracle.network(net), torch.from_numpy(s).requires_grad_()
+    module, states = net.module(), torch.from_numpy(s).requires_grad_()
     optimiser = torch.optim.Adam(module.parameters(), 0.05)
     falls = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 1 - step / 40)
     for _ in range(40):

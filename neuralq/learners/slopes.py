@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_positive, check_whole
@@ -41,6 +42,20 @@ class SlopeNet:
     def slopes(self, s: ArrayLike) -> NDArray[np.float64]:
         """∂v/∂s: ``[*n, d]`` to ``[*n, d]``."""
         return self._both(s)[1]
+
+    def module(self) -> torch.nn.Module:
+        """The same function for PyTorch, ``[*n, d]`` to ``[*n, 1]`` in float64.
+
+        Example:
+            >>> net, s = new_slope_net(2, 3, np.random.default_rng(0)), np.array([[0.3, -0.2]])
+            >>> bool(abs(net.module()(torch.from_numpy(s)).item() - net.values(s)[0]) < 1e-12)
+            True
+        """
+        num_hidden = (len(self.parameters) - 1) // (self.num_inputs + 2)
+        inner, outer = torch.nn.Linear(self.num_inputs, num_hidden), torch.nn.Linear(num_hidden, 1)
+        module = torch.nn.Sequential(inner, torch.nn.Tanh(), outer).double()
+        torch.nn.utils.vector_to_parameters(torch.from_numpy(self.parameters.copy()), module.parameters())
+        return module
 
     def _both(self, s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         given = np.asarray(s, np.float64)

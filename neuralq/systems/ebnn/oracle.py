@@ -23,7 +23,7 @@ from neuralq_envs.linear_quadratic import (
     action_values,
 )
 
-__all__ = ["chain_difference", "gradient_difference", "network", "oracle", "slope_difference", "value_difference"]
+__all__ = ["chain_difference", "gradient_difference", "oracle", "slope_difference", "value_difference"]
 
 
 def oracle() -> tuple[Row, ...]:
@@ -71,22 +71,6 @@ def slope_difference(num_states: int = 20, seed: int = 0, step: float = 1e-4) ->
     return float(np.abs(np.stack(numeric, axis=-1) - action_value_slopes(s, PUSH)).max())
 
 
-def network(net: SlopeNet) -> torch.nn.Module:
-    """The same function for PyTorch, in float64.
-
-    Example:
-        >>> net = new_slope_net(2, 3, np.random.default_rng(0))
-        >>> s = np.array([[0.3, -0.2]])
-        >>> bool(abs(network(net)(torch.from_numpy(s)).item() - net.values(s)[0]) < 1e-12)
-        True
-    """
-    num_hidden = (len(net.parameters) - 1) // (net.num_inputs + 2)
-    layers = [torch.nn.Linear(net.num_inputs, num_hidden), torch.nn.Tanh(), torch.nn.Linear(num_hidden, 1)]
-    module = torch.nn.Sequential(*layers).double()
-    torch.nn.utils.vector_to_parameters(torch.from_numpy(net.parameters.copy()), module.parameters())
-    return module
-
-
 def chain_difference(num_states: int = 4, seed: int = 0, num_transitions: int = 30) -> float:
     """How far the explained slope is from autograd through the theory's own episode, unrolled.
 
@@ -105,7 +89,7 @@ def _unrolled(theory: Theory, s: Tensor) -> tuple[NDArray[np.float64], Tensor]:
     """The states that the theory expects, and its discounted return with the whole graph."""
 
     def outputs(nets: Sequence[SlopeNet], x: Tensor) -> Tensor:
-        return torch.cat([network(net)(x) for net in nets], dim=-1)
+        return torch.cat([net.module()(x) for net in nets], dim=-1)
 
     left, value = [], torch.zeros(len(s), dtype=torch.float64)
     for step in range(HORIZON):
@@ -128,7 +112,7 @@ def gradient_difference(num_rows: int = 7, num_inputs: int = 3, num_hidden: int 
     y, mu = rng.normal(size=num_rows), rng.uniform(size=num_rows)
     gradient = np.zeros_like(net.parameters)
     loss = slope_gradient(net.parameters, s, y, slope, mu, gradient, np.zeros(num_hidden), np.zeros(num_inputs))
-    module, states = network(net), torch.from_numpy(s).requires_grad_()
+    module, states = net.module(), torch.from_numpy(s).requires_grad_()
     v = module(states)[:, 0]
     wrong = torch.from_numpy(slope) - input_slopes(v, states)
     theirs = (squared(torch.from_numpy(y) - v) + squared_slopes(wrong, torch.from_numpy(mu))).mean()
