@@ -50,6 +50,7 @@ WITHOUT_MODEL = {
     "neuralq/MountainCar-v0": TO_THE_BIT,
     "neuralq/Obelix-v0": "continuous; held to plain geometry in test_obelix.py",
     "neuralq/PoleBoxes-v0": "the next box depends on more than the box",
+    "neuralq/ThrunRobot-v0": "continuous; held to the geometry of the ground in test_thrun_robot.py",
 }
 WITHOUT_TWIN = {
     "neuralq/Backgammon-v0": "has no model to simulate",
@@ -60,6 +61,7 @@ WITHOUT_TWIN = {
     "neuralq/JobShop-v0": "has no model to simulate",
     "neuralq/Obelix-v0": "has no model to simulate",
     "neuralq/PoleBoxes-v0": "has no model to simulate",
+    "neuralq/ThrunRobot-v0": "has no model to simulate",
     "neuralq/ShortcutMaze-v0": "two models in turn, by a clock of its own",
 }
 NOISE = {"neuralq/MaximizationBias-v0": "standard_deviation"}  # of rewards about the model's; the model is deaf to it
