@@ -85,6 +85,7 @@ SYSTEMS = (
     "test_elevators",
     "test_job_shop",
     "test_obelix",
+    "test_thrun_robot_learning",
 )
 FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
 

@@ -40,6 +40,7 @@ SYSTEMS = {
     ),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
+    "thrun-robot": SystemEntry("neuralq.systems.thrun_robot:THRUN_ROBOT", "a robot that explains its way to a target"),
 }
 
 R = TypeVar("R")
