@@ -32,7 +32,7 @@ LISTED := $(STAMPS)/sources
 SIDE_BY_SIDE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test systems check slow mutants wheel clean always
+.PHONY: help demo test whole check slow mutants wheel clean always
 
 help:  ## lists the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
@@ -43,10 +43,10 @@ demo: $(DEMO_INSTALLED)  ## installs, then trains on CartPole, shows Baird's sta
 test: $(TEST_INSTALLED) $(LISTED)  ## installs what tests need, then runs the fast tests
 	@$(run_fast_tests)
 
-systems: $(TEST_INSTALLED)  ## runs the tests of whole systems, whose loops take a minute to compile
-	@$(PYTEST) $(SIDE_BY_SIDE) -m systems
+whole: $(TEST_INSTALLED)  ## runs the tests of whole systems, processes and pages, some minutes
+	@$(PYTEST) $(SIDE_BY_SIDE) -m whole
 
-slow: $(TEST_INSTALLED)  ## runs the slow tests, those of systems too
+slow: $(TEST_INSTALLED)  ## runs the slow tests, those of whole systems too
 	@$(PYTEST) $(SIDE_BY_SIDE) -m slow
 
 check: $(DEV_INSTALLED)  ## format, lint, types, floors, and the fast tests unless they passed on these very sources

@@ -75,17 +75,21 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
     return (FIRST.index(stem) if stem in FIRST else len(FIRST), -sizes[item.path], str(item.path))
 
 
-# Loops of whole systems take long to compile: their tests are run by `make systems`, which CI does too.
-SYSTEMS = (
-    "test_backgammon_fuzz",
-    "test_backgammon_learning",
-    "test_backgammon_match",
-    "test_backgammon_run",
-    "test_checkers_learning",
-    "test_elevators",
-    "test_job_shop",
-    "test_obelix",
-    "test_thrun_robot_learning",
+# What is tried whole takes long: systems whose loops have to be compiled, processes that are started, ended and killed,
+# pages in a browser, pictures. These are run by `make whole`, which CI does too.
+WHOLE = (
+    *("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run"),
+    *("test_checkers_learning", "test_elevators", "test_job_shop", "test_obelix", "test_thrun_robot_learning"),
+    *(
+        "test_checkpoint_kill",
+        "test_children",
+        "test_processes_of_others",
+        "test_signals",
+        "test_sweep",
+        "test_workers",
+    ),
+    *("test_docs", "test_export_torch", "test_lab_registry", "test_registry", "test_scripts"),
+    *("test_figures", "test_play_page", "test_report", "test_web_page"),
 )
 FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
 
@@ -93,10 +97,10 @@ FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_s
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
     for item in items:
-        of_system = item.path.stem in SYSTEMS or not FOLDERS.isdisjoint(item.path.parents)
-        if of_system and item.get_closest_marker("slow") is None:
+        is_whole = item.path.stem in WHOLE or not FOLDERS.isdisjoint(item.path.parents)
+        if is_whole and item.get_closest_marker("slow") is None:
             item.add_marker("slow")
-            item.add_marker("systems")
+            item.add_marker("whole")
     sizes = Counter(item.path for item in items)
     items.sort(key=lambda item: place(item, sizes))  # stable: the order within a file stays
     if not torch.cuda.is_available():

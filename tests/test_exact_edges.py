@@ -24,7 +24,7 @@ from neuralq.exact import (
     td_operator,
 )
 from neuralq.exact.problem import prepare
-from neuralq.exact.undiscounted import _most_steps
+from neuralq.exact.undiscounted import _most_steps, certified
 from neuralq.mdp import FiniteMDP
 
 
@@ -174,3 +174,10 @@ def test_a_cycle_is_named_whole_where_the_action_before_ends() -> None:
         ValueError, match=r"cycle state (0 → state 1 → state 0|1 → state 0 → state 1) earns 2 each time"
     ):
         solve(mdp, 1.0, "bellman-ford")
+
+
+@pytest.mark.parametrize(("cost", "reach"), [(0.7, 3.0), (0.5, math.inf), (0.3, math.inf)])
+def test_a_way_that_never_ends_is_ruled_out_by_more_than_the_error_of_all_steps(cost: float, reach: float) -> None:
+    """Leave for −1, or stay at a cost; values .1 too low may be off by .2 a step, of which there are up to three."""
+    mdp = FiniteMDP.from_arrays([[[0.0]], [[1.0]]], [[-1.0, -cost]], substochastic=True)
+    assert certified(prepare(mdp, 1.0), np.array([-1.1])).reach == pytest.approx(reach)

@@ -107,12 +107,12 @@ def linear_programming(problem: PlanningProblem, tol: float, limit: float) -> Fo
     options = {} if limit == np.inf else {"maxiter": int(limit)}
     # Its tolerances are absolute: rewards much smaller than 1 would all be within them. A power of two rounds nothing.
     unit = 2.0 ** math.floor(math.log2(problem.largest_reward or 1.0))
-    free = np.stack([np.where(problem.acts, -np.inf, 0.0), np.where(problem.acts, np.inf, 0.0)], axis=1)
+    least = np.where(problem.acts, -np.inf, 0.0)  # terminal values are 0, the least that they may be
     result = linprog(
         np.ones(mdp.num_states),
         A_ub=constraints,
         b_ub=-rows.reward / unit,
-        bounds=free,
+        bounds=np.stack([least, np.full(mdp.num_states, np.inf)], axis=1),
         method="highs",
         options=options,
     )

@@ -102,7 +102,7 @@ def _text(found: Mapping[str, tuple[Training, ...]]) -> tuple[str, ...]:
         "earns the same, so that the slope of a return is 0 nearly everywhere. A theory of smooth networks has slopes "
         "because it smooths these edges. Who is told slopes of 0 from the start, always believed, reaches "
         f"{flat:.0%} of the targets in the end, and who is told none {plain:.0%}.",
-        "Thrun's robot had a camera and sonars where this one is told two numbers: what is found here is about this one.",
+        "Thrun's robot had a camera and sonars, this one is told two numbers: what is found here is about this one.",
     )
 
 
