@@ -82,6 +82,12 @@ def test_slopes_count_as_they_are_said_to(made: Any) -> None:
     learned, nets, episodes = made
     (plain, nothing), (flat, all_of_it) = (learning.refit(nets, episodes, weight) for weight in (0.0, 1.0))
     explained, some = learning.refit(nets, episodes, learned)
+    hardly, less = learning.refit(nets, episodes, learned, weight=1e-9)
+    assert less == pytest.approx(1e-9 * some)
+    for a, b, c in zip(hardly, plain, explained, strict=True):
+        assert np.allclose(a.parameters, b.parameters, atol=1e-5) and not np.allclose(
+            a.parameters, c.parameters, atol=1e-2
+        )
     assert nothing == 0.0 and all_of_it == 1.0 and 0.0 <= some < 1.0
     s = episodes.s_tm1[episodes.real]
     steep = [np.mean([np.abs(net.slopes(s)).mean() for net in fitted]) for fitted in (plain, flat, explained)]
@@ -100,7 +106,8 @@ def test_contenders_of_one_seed_face_the_same() -> None:
         assert np.array_equal(one.paths[10][0], plain.paths[10][0])
     assert hand.success.tolist() == [1.0] * 11 and random.success[0] < 0.3
     assert plain.success[10] == (outcomes(plain.paths[10][-1]) > 0).mean() and not plain.believed.any()
-    assert train(seed, EXPLAINED, 2).believed.all()
+    believed, tenth = (train(seed, EXPLAINED, 1, weight=weight).believed for weight in (1.0, 0.1))
+    assert 0 < believed[0] <= 1 and 0 < tenth[0] < 0.5 * believed[0]
 
 
 def test_fewer_and_fewer_moves_are_random(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +118,7 @@ def test_fewer_and_fewer_moves_are_random(monkeypatch: pytest.MonkeyPatch) -> No
         return walk(nets, target, random_moves)
 
     monkeypatch.setattr(trainings, "walk", noting)
-    monkeypatch.setattr(trainings, "refit", lambda nets, episodes, source: (nets, 0.0))
+    monkeypatch.setattr(trainings, "refit", lambda nets, episodes, **given: (nets, 0.0))
     train(np.random.SeedSequence(0), NONE, 60)
     explores = np.array(told) >= 0
     expected = 0.3 * np.linspace(1, 0, 60).reshape(3, 20).mean(axis=1)
@@ -149,11 +156,24 @@ def test_the_page_says_what_its_interval_says(gains: Any, said: str, verdict: st
     assert page.measured[0].values == pytest.approx(gains)
 
 
+def test_episodes_are_counted_to_the_first_time_that_enough_is_reached() -> None:
+    path = {n: np.tile(np.array([[0.4, 0.0]]), (31, 1, 1)) for n in (10, 40)}
+    soon, never = (
+        Training(np.array(shares), np.zeros(3), path) for shares in ([0, 0.79, 0.8, 0.1], [0, 0.1, 0.7, 0.2])
+    )
+    found = dict.fromkeys(system.THRUN_ROBOT.contenders, (soon, soon)) | {system.WITH: (never, never)}
+    page = system.THRUN_ROBOT.page(found, False)
+    counted = {one.what.partition(":")[0]: one for one in page.measured if "until 80% of" in one.what}
+    assert counted[system.WITHOUT].values == (2, 2) and str(counted[system.WITH]) == "over 3" and len(counted) == 4
+    assert page.rows[1].ours == "over 3 against 2" and page.rows[1].verdict == "not reproduced"
+
+
 @pytest.mark.parametrize(
     ("act", "said"),
     [
         (lambda: train(np.random.SeedSequence(0), "nobody"), "source must be one of"),
         (lambda: train(np.random.SeedSequence(0), NONE, 0), "num_episodes must be"),
+        (lambda: train(np.random.SeedSequence(0), NONE, weight=0.0), "weight must be"),
         (lambda: theory.learn_theory(0, np.random.default_rng(0)), "num_steps must be"),
     ],
 )

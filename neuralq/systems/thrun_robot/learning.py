@@ -162,20 +162,21 @@ def expected_returns(theory: Theory, nets: Nets, episodes: Episodes, rows: Carri
     return total
 
 
-def refit(nets: Nets, episodes: Episodes, source: Theory | float) -> tuple[Nets, float]:
+def refit(nets: Nets, episodes: Episodes, source: Theory | float, weight: float = 1.0) -> tuple[Nets, float]:
     """The networks after they were fitted to all episodes, and how far slopes were believed in the mean.
 
     Args:
         nets: of each move.
         episodes: seen so far.
         source: a theory that explains slopes, which LOB* weighs; or how much slopes of 0 count, where 0 is for none.
+        weight: of an explained slope that is wholly believed.
     """
     rows = carried(nets, episodes)
     slopes, weights = np.zeros(episodes.s_tm1.shape), np.zeros(episodes.r_t.shape)
     if isinstance(source, Theory):
         slopes = explained_slopes(source, nets, episodes, rows)
         expected = torch.from_numpy(expected_returns(source, nets, episodes, rows))
-        weights = lob_star(expected, torch.from_numpy(rows.returns), LARGEST).numpy()
+        weights = lob_star(expected, torch.from_numpy(rows.returns), LARGEST).numpy() * weight
     else:
         weights[:] = source
     fitted = []

@@ -168,7 +168,7 @@ def _episodes(found: Mapping[str, tuple[Training, ...]], name: str) -> Measured:
     for one in found[name]:
         enough = np.nonzero(one.success >= _ENOUGH)[0]
         values.append(float(enough[0]) if len(enough) else float(len(one.success)))
-    limit = float(len(found[name][0].success))
+    limit = float(len(found[name][0].success) - 1)
     return Measured(f"{name}: episodes until {_ENOUGH:.0%} of the targets are reached", tuple(values), limit)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neuralq.checks import check_choice, check_whole
+from neuralq.checks import check_choice, check_positive, check_whole
 from neuralq.learners import new_slope_net
 from neuralq.systems.thrun_robot.learning import Episodes, Nets, action_values, refit, walk
 from neuralq.systems.thrun_robot.theory import Theory, learn_theory
@@ -33,6 +33,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Moves = NDArray[np.int64]
+Fit = Callable[[Nets, Episodes], tuple[Nets, float]]
 
 GOOD, BAD = 200, 5
 """Steps of each move that a theory was learned from."""
@@ -81,16 +82,17 @@ def drive(choose: Callable[[Array], Moves], targets: Array) -> Array:
     return np.stack(seen)
 
 
-def train(seed: np.random.SeedSequence, source: str, num_episodes: int = 40) -> Training:
+def train(seed: np.random.SeedSequence, source: str, num_episodes: int = 40, weight: float = 1.0) -> Training:
     """From nothing, with ε falling from .3 to 0; tests are greedy.
 
     Args:
         seed: of targets, random moves, the first networks, the theory and the test.
         source: one of `SOURCES`.
         num_episodes: to learn from.
+        weight: of an explained slope that is wholly believed, beside that of a value, which is 1.
 
     Raises:
-        ValueError: another source, or no episode.
+        ValueError: another source, no episode, or a weight that is not above 0.
 
     Example:
         >>> train(np.random.SeedSequence(0), "by hand", 3).success.tolist()
@@ -98,6 +100,7 @@ def train(seed: np.random.SeedSequence, source: str, num_episodes: int = 40) -> 
     """
     check_choice("source", source, SOURCES)
     check_whole("num_episodes", num_episodes)
+    check_positive("weight", weight)
     rng = np.random.default_rng(seed)
     tests, targets = draw_targets(_NUM_TESTS, rng), draw_targets(num_episodes, rng)
     explores = rng.random((num_episodes, MAX_STEPS)) < _EPSILON * np.linspace(1, 0, num_episodes)[:, None]
@@ -110,18 +113,18 @@ def train(seed: np.random.SeedSequence, source: str, num_episodes: int = 40) -> 
     slopes: Theory | float = float(source == FLAT)
     if source in (EXPLAINED, WEIGHED):
         slopes = learn_theory(GOOD if source == EXPLAINED else BAD, rng)
-    return _learned(nets, slopes, tests, targets, moves)
+    return _learned(nets, partial(refit, source=slopes, weight=weight), tests, targets, moves)
 
 
-def _learned(nets: Nets, source: Theory | float, tests: Array, targets: Array, moves: Moves) -> Training:
+def _learned(nets: Nets, fit: Fit, tests: Array, targets: Array, moves: Moves) -> Training:
     walked: list[Episodes] = []
     believed, paths = [], [drive(partial(_best, nets), tests)]
     for target, instead in zip(targets, moves, strict=True):
         walked.append(walk(nets, target, instead))
         episodes = Episodes(*(np.concatenate(arrays, axis=1) for arrays in zip(*walked, strict=True)))
         for _ in range(_NUM_FITS):
-            nets, weight = refit(nets, episodes, source)
-        believed.append(weight)
+            nets, believes = fit(nets, episodes)
+        believed.append(believes)
         paths.append(drive(partial(_best, nets), tests))
     success = np.array([_reached(path) for path in paths])
     return Training(success, np.array(believed), {n: paths[n] for n in SHOWN if n < len(paths)})
