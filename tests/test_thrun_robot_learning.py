@@ -103,6 +103,23 @@ def test_contenders_of_one_seed_face_the_same() -> None:
     assert train(seed, EXPLAINED, 2).believed.all()
 
 
+def test_fewer_and_fewer_moves_are_random(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, walk = [], learning.walk
+
+    def noting(nets: Any, target: Any, random_moves: Any) -> Any:
+        told.append(random_moves)
+        return walk(nets, target, random_moves)
+
+    monkeypatch.setattr(trainings, "walk", noting)
+    monkeypatch.setattr(trainings, "refit", lambda nets, episodes, source: (nets, 0.0))
+    train(np.random.SeedSequence(0), NONE, 60)
+    explores = np.array(told) >= 0
+    expected = 0.3 * np.linspace(1, 0, 60).reshape(3, 20).mean(axis=1)
+    shares = explores.reshape(3, -1).mean(axis=1)
+    assert (np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / 600)).all() and not explores[-1].any()
+    assert np.bincount(np.array(told)[explores]) == pytest.approx([explores.sum() / 3] * 3, rel=0.3)
+
+
 def test_paths_on_the_ground_keep_the_target_where_it_is() -> None:
     targets = draw_targets(20, np.random.default_rng(0))
     seen = trainings.drive(by_geometry, targets)

@@ -73,7 +73,8 @@ def path_picture(found: Mapping[str, Training]) -> Picture:
     svg = draw_svg("paths", "Paths of the robot from above", said, (5.6, 2.7 * max(len(shown), 1)), paint)
     caption = (
         f"From above, the first seed; the robot begins at 0 and faces upwards. Blue: ways that end within {NEAR:g} m "
-        "of their target (dots). Orange: ways that lose theirs (crosses) or take longer than 30 steps."
+        "of their target (dots). Orange: targets that are lost, or not reached after 30 steps (crosses); who only "
+        "turns leaves no line."
     )
     return Picture("The robot from above", svg, caption)
 
