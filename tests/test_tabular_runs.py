@@ -219,11 +219,13 @@ def test_a_hook_sees_every_step_and_changes_nothing(tmp_path: Path) -> None:
 def test_returns_are_the_environments_whatever_is_learned_from(simulate: bool) -> None:
     """Halves of rewards are exact, so the same is drawn and done."""
     returns, short = [], {"max_episode_steps": 60}
-    for scale in (1.0, 0.5):
+    for scale, stretch in ((1.0, 400), (0.5, 400), (0.5, 40)):
         made = config("CliffWalking-v1", {"simulate": simulate}, env_kwargs=short, reward_scale=scale)
-        ended = build_session(made).stream.advance(400, StopRequest())
+        stream = build_session(made).stream
+        ended = [one for until in range(stretch, 401, stretch) for one in stream.advance(until, StopRequest())]
         returns.append([(one.episode_return, one.length) for one in ended])
-    assert returns[0] == returns[1] and len(returns[0]) >= 6 and all(one <= -length for one, length in returns[0])
+    assert returns[0] == returns[1] == returns[2] and len(returns[0]) >= 6
+    assert all(one <= -length for one, length in returns[0])
 
 
 def test_a_stop_is_obeyed_within_the_next_hundred_steps() -> None:
