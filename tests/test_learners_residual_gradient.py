@@ -218,7 +218,7 @@ def test_refusals_name_the_way_out() -> None:
     learner = ResidualGradientLearner(TorchEngine(TableQ(3, 1), Loss()), ResidualGradientSettings())
     with pytest.raises(ValueError, match="must leave the same states"):
         learner.update(split_rows([0]), independent=split_rows([2]))
-    other = split_rows([0])._replace(a_tm1=torch.ones(1, dtype=torch.int64))
+    other = dataclasses.replace(split_rows([0]), a_tm1=torch.ones(1, dtype=torch.int64))
     learner.update(split_rows([0]), independent=other)  # the value of a state asks for no action
     of_actions = ResidualGradientLearner(TorchEngine(TableQ(3, 2), Loss()), ResidualGradientSettings())
     with pytest.raises(ValueError, match="by the same actions"):
