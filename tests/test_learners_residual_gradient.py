@@ -218,5 +218,10 @@ def test_refusals_name_the_way_out() -> None:
     learner = ResidualGradientLearner(TorchEngine(TableQ(3, 1), Loss()), ResidualGradientSettings())
     with pytest.raises(ValueError, match="must leave the same states"):
         learner.update(split_rows([0]), independent=split_rows([2]))
+    other = dataclasses.replace(split_rows([0]), a_tm1=torch.ones(1, dtype=torch.int64))
+    learner.update(split_rows([0]), independent=other)  # the value of a state asks for no action
+    of_actions = ResidualGradientLearner(TorchEngine(TableQ(3, 2), Loss()), ResidualGradientSettings())
+    with pytest.raises(ValueError, match="by the same actions"):
+        of_actions.update(split_rows([0]), independent=other)
     with pytest.raises(ValueError, match="weight must have the shape"):
         learner.update(split_rows([0]), weight=torch.ones(2))

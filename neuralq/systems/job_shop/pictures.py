@@ -58,8 +58,7 @@ def gantt_picture(problem: JobShop, repaired: Repaired) -> Picture:
     svg = draw_svg("gantt", "The schedule before and after", said, (6.0, 5.2), paint)
     caption = (
         "A held-out problem of three missions (colours). Before: every task as early as the tasks before it allow, "
-        "with "
-        "pools drawn by chance; red is what the four pools do not have. After: the same tasks without a conflict."
+        "with pools drawn by chance; red is what the four pools do not have. After: the same without a conflict."
     )
     return Picture("Before and after", svg, caption)
 
@@ -130,8 +129,7 @@ def quality_picture(sets: Mapping[str, Mapping[str, tuple[float, float]]]) -> Pi
     )
     svg = draw_svg("quality", "RDF and repairs", said, (6.0, 3.9), paint)
     caption = (
-        "Lower is a shorter schedule, further left is less work. A repair that is drawn is soon finished, with a "
-        "schedule "
+        "Lower is a shorter schedule, further left is less work. Repairs that are drawn are soon over, with a schedule "
         "nobody wants. The list scheduler makes no repairs and knows the whole problem: it is better than all of them."
     )
     return Picture("How good, for how many repairs", svg, caption)
