@@ -18,6 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from neuralq.runs.stream import EnvironmentFault, Episode, Interaction, Step, interact
 from neuralq.runs.stream.early_returns import EarlyReturns
+from neuralq.runs.stream.encoding import encoder_for
 from neuralq.runs.stream.vector_env import make_vector_env
 
 
@@ -230,3 +231,10 @@ def test_the_next_episode_begins_anew_and_after_a_thousand_steps_nobody_watches(
         assert watch.add(one_step([1.0, 1.0], [0, 1], (0, 1))) is watch and not said, k
     assert watch.add(one_step([1.0], [1], (1,))) is watch  # 999 steps of environments
     assert watch.add(one_step([1.0], [0], (0,))) is None and not said
+
+
+def test_one_observation_of_parts_is_told_from_many() -> None:
+    encoder = encoder_for(spaces.Dict({"place": spaces.Box(-1, 1, (2,)), "kind": spaces.Discrete(3)}))
+    assert not encoder.is_batch({"place": np.zeros(2), "kind": 1})
+    assert encoder.is_batch({"place": np.zeros((4, 2)), "kind": np.ones(4, dtype=np.int64)})
+    assert not encoder.is_batch(np.zeros(2))

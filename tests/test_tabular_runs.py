@@ -224,6 +224,7 @@ def test_returns_are_the_environments_whatever_is_learned_from(simulate: bool) -
         stream = build_session(made).stream
         ended = [one for until in range(stretch, 401, stretch) for one in stream.advance(until, StopRequest())]
         returns.append([(one.episode_return, one.length) for one in ended])
+        assert {len(column) for column in stream.last_step().rows} == {1}
     assert returns[0] == returns[1] == returns[2] and len(returns[0]) >= 6
     assert all(one <= -length for one, length in returns[0])
 
