@@ -215,6 +215,11 @@ def test_a_hook_sees_every_step_and_changes_nothing(tmp_path: Path) -> None:
     assert len(within.steps) == 50 and within.steps[0][0] == 0
 
 
+def test_a_table_with_a_mask_is_given_its_state_and_what_is_allowed() -> None:
+    shapes = [build_session(config(env, {"simulate": False})).stream.spec.shape for env in ("Taxi-v4", "FrozenLake-v1")]
+    assert shapes == [(1 + 6,), ()]
+
+
 @pytest.mark.parametrize("simulate", [True, False])
 def test_returns_are_the_environments_whatever_is_learned_from(simulate: bool) -> None:
     """Halves of rewards are exact, so the same is drawn and done."""
