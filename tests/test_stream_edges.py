@@ -238,3 +238,8 @@ def test_one_observation_of_parts_is_told_from_many() -> None:
     assert not encoder.is_batch({"place": np.zeros(2), "kind": 1})
     assert encoder.is_batch({"place": np.zeros((4, 2)), "kind": np.ones(4, dtype=np.int64)})
     assert not encoder.is_batch(np.zeros(2))
+
+
+def test_bytes_of_two_axes_are_frames_and_of_one_are_numbers() -> None:
+    layouts = [encoder_for(spaces.Box(0, 255, shape, np.uint8)).layout for shape in ((6,), (6, 6), (3, 6, 6))]
+    assert layouts[1:] == ["image", "image"] and layouts[0] != "image"
