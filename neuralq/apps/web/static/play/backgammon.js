@@ -1,7 +1,7 @@
 // The page: what the server says is shown, what is chosen is asked for. All rules are the server's.
 
 import { Board } from "./board.js";
-import { Seat, remember, remembered, say } from "./seat.js";
+import { Seat, complain, remember, remembered, say } from "./seat.js";
 import { record, turnTable } from "./turns.js";
 
 const $ = (id) => document.getElementById(id);
@@ -136,11 +136,6 @@ async function showHints() {
     hinted = "";
     complain(error.message);
   }
-}
-
-function complain(text) {
-  $("error").hidden = !text;
-  $("error").textContent = text ?? "";
 }
 
 // ---- what is done

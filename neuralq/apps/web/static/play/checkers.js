@@ -1,6 +1,6 @@
 // The page: what the server says is shown, what is chosen is asked for. All rules are the server's.
 
-import { Seat, remember, remembered, say } from "./seat.js";
+import { Seat, complain, remember, remembered, say } from "./seat.js";
 
 const $ = (id) => document.getElementById(id);
 const seat = new Seat();
@@ -228,11 +228,6 @@ async function showHints() {
     hinted = "";
     complain(error.message);
   }
-}
-
-function complain(text) {
-  $("error").hidden = !text;
-  $("error").textContent = text ?? "";
 }
 
 // ---- what is done

@@ -92,3 +92,10 @@ export class Seat {
 export function say(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
+
+// What could not be done, in the page's line for it; without a text the line is hidden.
+export function complain(text) {
+  const line = document.getElementById("error");
+  line.hidden = !text;
+  line.textContent = text ?? "";
+}

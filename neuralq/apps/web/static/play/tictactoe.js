@@ -1,6 +1,6 @@
 // The page: what the server says is shown, what is chosen is asked for. All rules are the server's.
 
-import { Seat, remember, remembered, say } from "./seat.js";
+import { Seat, complain, remember, remembered, say } from "./seat.js";
 
 const $ = (id) => document.getElementById(id);
 const seat = new Seat();
@@ -69,8 +69,7 @@ async function act(what, fields = {}) {
   if (state === null || (what === "move" && (state.result !== null || state.cells[fields.cell]))) return;
   const answer = await seat.act(what, fields);
   if (answer === null) return;
-  $("error").hidden = !answer.complaint;
-  $("error").textContent = answer.complaint ?? "";
+  complain(answer.complaint);
   if (answer.state) show(answer.state);
 }
 
@@ -109,7 +108,6 @@ $("values").addEventListener("change", () => {
 try {
   show((await seat.resume()).state);
 } catch (error) {
-  $("error").hidden = false;
-  $("error").textContent = error.message;
+  complain(error.message);
   say($("status"), "There is no game.");
 }
