@@ -342,8 +342,8 @@ def _parts_of(space: Space[Any], keys: tuple[int | str, ...]) -> Iterator[Part]:
     elif isinstance(space, spaces.MultiDiscrete):
         yield _discrete_part(keys, space.shape, _WHOLE, space, space.nvec.ravel(), space.start.ravel())
     elif isinstance(space, spaces.MultiBinary):
-        ones = np.ones(math.prod(space.shape), np.int64)
-        yield _discrete_part(keys, space.shape, _BINARY, space, 2 * ones, 0 * ones)
+        bits = math.prod(space.shape)
+        yield _discrete_part(keys, space.shape, _BINARY, space, np.full(bits, 2), np.zeros(bits, np.int64))
     else:
         where = f" at {_name(keys)}" if keys else ""
         way_out = (

@@ -137,7 +137,7 @@ class Normalisation:
         """
         if not self.observations:
             return None
-        count, squares = self._state["observation_count"][0], self._state["observation_squares"]
+        (count,), squares = self._state["observation_count"], self._state["observation_squares"]
         return self._state["observation_mean"].copy(), np.array([1.0 / _spread(x, count) for x in squares])
 
     def reward(self, r_t: Array, last_t: Array, moved: Array) -> Array:
