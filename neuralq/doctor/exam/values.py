@@ -293,7 +293,9 @@ def generalisation(case: Case) -> Finding:
     if stored is None:
         raise CannotMeasure("the data that was learned from was not given (--data file.npz)")
     masks = legal_in_data(case)
-    known = np.ones(len(stored["reward"]), bool) if masks is None else stored["terminated"] | masks[1].any(1)
+    known = (
+        np.ones(len(stored["reward"]), bool) if masks is None else stored["terminated"].astype(bool) | masks[1].any(1)
+    )
     if not known.any():
         raise CannotMeasure("of no stored step it is known which actions were legal after it")
     pick = case.rng(18).permutation(np.flatnonzero(known))[:2000]
