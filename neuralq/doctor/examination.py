@@ -93,8 +93,8 @@ def examine(
             by default.
         gamma: γ; by default what the file says, else 0.99.
         data: what was learned from: the path of an ``.npz``, "minari:ID" of a data set of Minari's (extra minari), or a
-            mapping of the columns ``obs, action, reward, terminated, truncated, next_obs`` and perhaps ``age``; or laid
-            out as D4RL's. By default what a neuralq run keeps in its replay.
+            mapping of the columns ``obs, action, reward, terminated, truncated, next_obs`` and perhaps ``age`` and
+            ``action_mask``; or laid out as D4RL's. By default what a neuralq run keeps in its replay.
         settings: of the training, where the file does not say: fields of `Settings`, such as
             ``{"target_period_updates": 500, "updates": 50_000}``.
         net: "module:Class" of a network that a state dict belongs to.
@@ -214,7 +214,9 @@ def _columns(data: Any) -> dict[str, Array] | None:
     if isinstance(data, str | Path):
         data = read_arrays(plain_bytes(Path(data)), str(data))
     if isinstance(data, Mapping):
-        return stored.of_recorded(recorded_from(data)) if "observations" in data else stored.check_columns(data)
+        if "observations" in data:
+            return stored.of_recorded(recorded_from(data), data.get("action_mask"))
+        return stored.check_columns(data)
     raise ValueError(f"data must be the path of an .npz or a mapping of columns, got {type(data).__name__}")
 
 

@@ -165,10 +165,9 @@ def fit(case: Case, seeds: int = 3) -> Finding:
     network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
     if network is None or encode is None or outputs is None:
         raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
+    _refuse_pictures(case)
     s, a, g, names = labelled(case, 4000)
     x = case.world.as_rows(s)
-    if x.shape[1] > 2000:
-        raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
     ours = torch.as_tensor((x - x.mean(0)) / np.where(x.std(0) > 1e-12, x.std(0), 1.0)).float()
     theirs = encode(s)
     gaps, scores = [], []
@@ -192,6 +191,11 @@ def fit(case: Case, seeds: int = 3) -> Finding:
         "a wider body with LayerNorm, and observations scaled to about ±1",
         f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
     )  # fmt: skip
+
+
+def _refuse_pictures(case: Case) -> None:
+    if case.width > 2000:
+        raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
 
 
 def _our_body(width: int, num_actions: int, rng: np.random.Generator) -> nn.Module:
@@ -332,8 +336,9 @@ def _difference(more: Sequence[float], less: Sequence[float]) -> tuple[float, fl
 
 
 def _factorial(plan: _Plan, found: Experiments) -> list[Finding]:
-    steps = plan.steps_for(4 * plan.seeds)
     case = plan.case
+    _refuse_pictures(case)
+    steps = plan.steps_for(4 * plan.seeds)
     ours = {"learner": "rollout", "normalise_observations": False}
     wide = {"hidden": _OUR_HIDDEN, "layer_norm": True}
     normalised: Maker | None = None if case.world.is_discrete else lambda: _normalised(case, case.world.make())

@@ -33,11 +33,10 @@ def capacity(case: Case) -> Finding:
     network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
     if network is None or encode is None or outputs is None:
         raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
-    s, a, g, names = labelled(case, _NUM_ROWS)
-    x = case.world.as_rows(s)
-    if x.shape[1] > _MOST_WIDTH or sum(p.numel() for p in network.parameters()) > _MOST_WEIGHTS:
+    if case.width > _MOST_WIDTH or sum(p.numel() for p in network.parameters()) > _MOST_WEIGHTS:
         raise CannotMeasure("it trains fresh networks, which the budget does not allow for one of this size")
-    theirs, with_action = encode(s), np.concatenate([x, np.eye(case.world.num_actions)[a]], axis=1)
+    s, a, g, names = labelled(case, _NUM_ROWS)
+    theirs, with_action = encode(s), np.concatenate([case.world.as_rows(s), np.eye(case.world.num_actions)[a]], axis=1)
     divisions = []
     for seed in range(_SEEDS):
         rng = case.rng(320 + seed)

@@ -62,6 +62,16 @@ class Case:
         return np.random.default_rng([self.seed, number])
 
     @property
+    def masked(self) -> bool:
+        """Whether the environment says which actions are legal."""
+        return self.greedy[0].legal is not None
+
+    @property
+    def width(self) -> int:
+        """Numbers of an observation as a row for regressions."""
+        return int(self.world.as_rows(self.greedy[0].observations[:1]).shape[1])
+
+    @property
     def episodes(self) -> list[Episode]:
         """Of every policy."""
         return [*self.greedy, *self.explored, *self.chance, *(one for all_ in self.constant.values() for one in all_)]
