@@ -89,7 +89,7 @@ class AliasedGridEnv(gymnasium.Env[Any, Any]):
     Example:
         >>> env = AliasedGridEnv(mccallum(), mccallum_grid())
         >>> [env.reset(options={"state": cell})[0] for cell in (5, 7, 9, 2)]
-        [3, 3, 3, 2]
+        [4, 4, 4, 2]
     """
 
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
