@@ -22,12 +22,14 @@ from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypoth
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
+from neuralq.doctor.origins.neuralq_run import settings_of_run
 from neuralq.doctor.play import Clock
 from neuralq.doctor.subject import Settings, of_network
 from neuralq.doctor.tree import decide
 from neuralq.doctor.worlds import open_world
 from neuralq.exact import solve
 from neuralq.mdp import FiniteMDP
+from neuralq.runs.recipe.config import config_from_dict
 from neuralq.types import Array
 
 
@@ -771,6 +773,39 @@ def test_a_buffer_that_holds_too_little_is_named_with_and_without_the_data() -> 
     assert stored.window(small).flagged and not stored.window(large).flagged
 
 
+@pytest.mark.parametrize(
+    ("measure", "ill", "well", "value"),
+    [
+        (
+            stored.few_batches,
+            {"capacity": 639.0, "batch_size": 64.0},
+            {"capacity": 640.0, "batch_size": 64.0},
+            639 / 64,
+        ),
+        (stored.greedy_only, {"epsilon_start": 0.0, "epsilon_end": 0.0}, {"epsilon_start": 0.1, "epsilon_end": 0.0}, 0),
+    ],
+)
+def test_a_setting_that_is_a_mistake_is_named_though_all_went_well(
+    measure: Any, ill: dict[str, float], well: dict[str, float], value: float
+) -> None:
+    found, twin = (measure(case_of(lambda: Counting(), both(lambda t: t), settings=Settings(**s))) for s in (ill, well))
+    assert found.flagged and found.value == pytest.approx(value) and not twin.flagged
+    assert decide([calm("V1"), calm("V2"), found])[0][0].grade == "B"
+    for name in ill:
+        with pytest.raises(CannotMeasure, match=f"--set .*{name}="):
+            measure(case_of(lambda: Counting(), both(lambda t: t), settings=Settings(**{**ill, name: None})))
+
+
+def test_noisy_layers_explore_without_epsilon() -> None:
+    settings = [
+        settings_of_run(
+            config_from_dict({"learner": "replay", "epsilon_start": 0.0, "epsilon_end": 0.0, "replay": own}), None
+        )
+        for own in ({}, {"noisy": True})
+    ]
+    assert [s.epsilon_start for s in settings] == [0.0, None] and [s.epsilon_end for s in settings] == [0.0, None]
+
+
 def test_stored_actions_are_those_that_the_environment_names() -> None:
     """Numbered from 3, and worth t and t + 100: read from another number they would be each other's, or none."""
 
@@ -887,6 +922,21 @@ def test_a_policy_that_has_learned_right_values_is_healthy_whatever_its_vital_si
         assert [one.grade for one in found] == [grade]
     found, headline = decide([calm("V1"), calm("V2"), flagged("D1", "data")])
     assert found[0].grade == "B" and headline.startswith("Data")
+
+
+def test_values_that_are_only_too_low_are_a_vital_sign() -> None:
+    low, high = flagged("V2", "algorithm", value=-0.4), flagged("V2", "algorithm", value=0.4)
+    found, headline = decide([calm("V1"), low, calm("V6"), flagged("V6a", "algorithm")])
+    assert [one.grade for one in found] == ["C", "C"] and "lower than what it returns" in headline
+    for ill in (
+        "V1",
+        "V3",
+        "V5",
+        "V6",
+    ):  # a policy that has not learned, a mistake that explains it, order that is lost
+        assert decide([calm("V1"), low, flagged(ill, "algorithm")])[0][0].grade == "B", ill
+    assert decide([calm("V1"), high, calm("V6")])[0][0].grade == "B"
+    assert decide([calm("V1"), low, flagged("V4", "algorithm", value=2.0)])[0][0].grade == "B"
 
 
 def test_what_no_measurement_explains_is_not_explained_away() -> None:
