@@ -231,12 +231,21 @@ def test_lives_of_one_seed_are_alike_and_filmed_to_their_end() -> None:
 
 @pytest.mark.slow
 def test_behaviours_push_more_than_one_learner_and_than_what_was_written_by_hand() -> None:
+    """With seeds of its own: of 20, as the command has them, a ratio of 1.5 is known to ±.4 only."""
+    seeds = range(5000, 5100)
+
+    def share(control: str, generaliser: str = "table") -> float:
+        return float(np.mean([spend(seed, control, generaliser, filmed_steps=0).share for seed in seeds]))
+
+    alone = {one: share("monolith", one) for one in GENERALISERS}
+    by_hand = share("by hand")
+    for one in GENERALISERS:
+        assert share("behaviours", one) >= 1.5 * max(alone[one], by_hand)
+    assert alone["clusters"] >= 1.3 * alone["table"]
+    assert share("random") <= 0.3 * alone["table"]  # the control that must fail
+
+
+@pytest.mark.slow
+def test_the_page_says_what_came_out() -> None:
     found = run_system(system_named("obelix"))
-    share = {one.what.partition(":")[0]: float(np.mean(one.values)) for one in found.measured}
     assert len(found.measured[0].values) == 20 and not found.wrong
-    for one in ("table", "Hamming"):
-        assert share[f"behaviours, {one}"] >= 1.5 * max(share[f"monolith, {one}"], share["by hand"])
-    # With clusters 60 other seeds give 1.3 of one learner and 1.2 of the table; 20 do not tell that from 1.5 and 1.3.
-    assert share["behaviours, clusters"] >= 1.2 * share["monolith, clusters"]
-    assert share["monolith, clusters"] >= 1.1 * share["monolith, table"]
-    assert share["random moves"] <= 0.3 * share["monolith, table"]  # the control that must fail
