@@ -12,7 +12,7 @@ import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import blackjack_exact
 import gymnasium as gym
@@ -161,6 +161,52 @@ def test_the_mask_of_an_environment_is_obeyed_and_learned() -> None:
     assert np.array_equal((table.q > -np.inf)[~terminal], legal[~terminal])
 
 
+def test_a_mask_that_only_a_method_tells_is_obeyed() -> None:
+    class Told(Corridor):
+        def _extras(self) -> dict[str, Any]:
+            return {}
+
+        def action_masks(self) -> list[bool]:
+            return [self.cell > 5, True]
+
+    gym.register("Told-v0", Told, disable_env_checker=True)
+    try:
+        session = walked(build_session(config("Told-v0", env_kwargs={"masked": True})), 200)
+    finally:
+        del gym.registry["Told-v0"]
+    assert session.learner.loop.table.num_legal.tolist() == [1, 2, 2, 2, 2]  # type: ignore[attr-defined]
+
+
+def test_where_mask_and_table_have_no_action_in_common_the_table_is_obeyed() -> None:
+    class Torn(gym.Env[Any, Any]):
+        """Two states; the table knows only action 1 of state 0, which the mask forbids."""
+
+        observation_space, action_space = spaces.Discrete(2), spaces.Discrete(2)
+        P: ClassVar = {0: {1: [(1.0, 1, 0.0, False)]}, 1: {a: [(1.0, 0, 1.0, False)] for a in (0, 1)}}
+        initial_state_distrib = np.array([1.0, 0.0])
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+            super().reset(seed=seed)
+            self.s = 0
+            return 0, {"action_mask": self.action_mask(0)}
+
+        def step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+            self.s = 1 - self.s
+            return self.s, float(self.s == 0), False, False, {"action_mask": self.action_mask(self.s)}
+
+        def action_mask(self, s: int) -> Any:
+            return np.array([1, s == 1], np.int8)
+
+    gym.register("Torn-v0", Torn, disable_env_checker=True)
+    try:
+        session = build_session(config("Torn-v0", env_kwargs={"max_episode_steps": 20}))
+    finally:
+        del gym.registry["Torn-v0"]
+    stream = session.stream
+    assert isinstance(stream, TableWalk) and stream.simulated and stream._allowed is not None
+    assert stream._allowed.tolist() == [[False, True], [True, True]]
+
+
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
@@ -194,6 +240,15 @@ def test_states_of_a_tuple_are_those_of_the_encoder() -> None:
     for wrong in [(3, 0, 0), (0, -2, 0), (0, 0), None]:
         with pytest.raises(WalkFault):
             read(wrong)
+
+
+def test_states_of_several_numbers_are_those_of_the_encoder() -> None:
+    space = spaces.MultiDiscrete([3, 4])
+    encoder = encoder_for(space, as_index=True)
+    read = _reader(space, encoder)
+    assert [read(np.array(x)) for x in ((0, 0), (2, 1))] == [int(encoder.encode_single(x)) for x in ((0, 0), (2, 1))]
+    with pytest.raises(WalkFault):
+        read(np.array([3, 0]))
 
 
 def test_a_hook_sees_every_step_and_changes_nothing(tmp_path: Path) -> None:
