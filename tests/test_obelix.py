@@ -185,7 +185,7 @@ def test_clusters_are_what_they_say() -> None:
 
 
 def test_where_there_is_no_room_for_another_cluster_the_likeliest_is_joined() -> None:
-    memory, values = bit_clusters(2, 1, likelihood=0.2), np.zeros(1)
+    memory = bit_clusters(2, 1, likelihood=0.2)
     for y in range(memory.q.shape[0]):
         bit_update(memory, 0, 0, 10.0 * y, 1.0)
     bit_update(memory, 3, 0, -10.0, 0.5)
