@@ -56,8 +56,8 @@ def modules_picture(study: Study) -> Picture:
     svg = draw_svg("modules", "Modules and gates of CQ-L", said, (5.4, 5.2), paint)
     caption = (
         "CQ-L, first seed. Above: the largest action value of each module by cell, less what it is beside the landmark "
-        "that it learned to reach; that and the wall are blank. Below: which module the gate gives to each stage of the "
-        "composite tasks."
+        "that it learned to reach; that and the wall are blank. Below: which module the gate gives to each stage "
+        "of the composite tasks."
     )
     return Picture("Modules and gates", svg, caption)
 
