@@ -47,6 +47,8 @@ WITHOUT_MODEL = {
     "neuralq/LinearQuadratic-v0": "continuous; its values are known in closed form, held in test_slopes.py",
     "neuralq/Elevators-v0": "continuous, with people who come when they like",
     "neuralq/JobShop-v0": "every reset draws another problem, and a schedule of 51 tasks has more states than atoms",
+    "neuralq/LittmanMaze-v0": "cells look alike; held to the model of its cells in test_aliased.py",
+    "neuralq/McCallumMaze-v0": "cells look alike; held to the model of its cells in test_aliased.py",
     "neuralq/MountainCar-v0": TO_THE_BIT,
     "neuralq/Obelix-v0": "continuous; held to plain geometry in test_obelix.py",
     "neuralq/PoleBoxes-v0": "the next box depends on more than the box",
@@ -59,6 +61,8 @@ WITHOUT_TWIN = {
     "neuralq/LinearQuadratic-v0": "has no model to simulate",
     "neuralq/Elevators-v0": "has no model to simulate",
     "neuralq/JobShop-v0": "has no model to simulate",
+    "neuralq/LittmanMaze-v0": "has no model to simulate",
+    "neuralq/McCallumMaze-v0": "has no model to simulate",
     "neuralq/Obelix-v0": "has no model to simulate",
     "neuralq/PoleBoxes-v0": "has no model to simulate",
     "neuralq/ThrunRobot-v0": "has no model to simulate",
@@ -69,7 +73,7 @@ NOISE = {"neuralq/MaximizationBias-v0": "standard_deviation"}  # of rewards abou
 _SIGNS = "S..G\n.#..\n.T.x\n..CC"
 _GRID = {
     "layout": _SIGNS, "step_reward": -0.5, "goal_reward": 2.0, "trap_reward": -3.0, "cliff_reward": -7.0,
-    "wind": (0, 1, 0, 2), "slip": 0.3, "num_moves": 8, "blocked": "illegal",
+    "bump_reward": -0.25, "wind": (0, 1, 0, 2), "slip": 0.3, "num_moves": 8, "blocked": "illegal",
 }  # fmt: skip
 # Other values than the defaults; each keyword must change the model in one of them.
 VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {

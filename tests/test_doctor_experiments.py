@@ -14,11 +14,21 @@ from gymnasium import spaces
 from torch import nn
 
 from neuralq.doctor import Settings, examine
-from neuralq.doctor.exam.capacity import t_interval
+from neuralq.doctor.exam.capacity import capacity, t_interval
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
 from neuralq.doctor.exam.seeds import luck_of, seeds_needed
 from neuralq.doctor.exam.signs import fresh
-from neuralq.doctor.experiments import _difference, _Plan, _Repair, _repaired, fit, run_experiments, separating
+from neuralq.doctor.experiments import (
+    Experiments,
+    _difference,
+    _factorial,
+    _Plan,
+    _Repair,
+    _repaired,
+    fit,
+    run_experiments,
+    separating,
+)
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
 from neuralq.doctor.play import Clock
@@ -100,6 +110,38 @@ def test_a_repair_is_confirmed_by_what_runs_return_and_by_nothing_else(monkeypat
         "target_period_updates": 20, "train_period": 4, "hidden": (7,),
     }  # fmt: skip
     assert [seed for settings, seed in asked if settings["learning_rate"] == 0.005] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("better", ["algorithm", "representation", "nothing"])
+def test_a_main_effect_is_that_of_what_was_changed_and_of_nothing_else(
+    failed: Case, monkeypatch: pytest.MonkeyPatch, better: str
+) -> None:
+    """The runs are stood in for: another algorithm, another body, or nothing is worth 10 more."""
+
+    def run(self: _Plan, settings: Any, seed: int, steps: int, make: Any) -> float:
+        gains = {"algorithm": settings["learner"] == "rollout", "representation": make is not None}
+        assert (make is not None) == (settings["hidden"] == (256, 256))
+        return seed + 10.0 * gains.get(better, False)
+
+    monkeypatch.setattr(_Plan, "run", run)
+    found, plan = Experiments(), _Plan(failed, 3)
+    effects = {one.cause: one for one in _factorial(plan, found)}
+    assert {cause for cause, one in effects.items() if one.flagged} == {better} - {"nothing"}
+    assert {cause: one.value for cause, one in effects.items()} == {
+        cause: 10.0 * (cause == better) for cause in ("algorithm", "representation")
+    }
+    bodies = {"algorithm": [[101, 111], [101, 111]], "representation": [[101, 101], [111, 111]]}
+    assert found.factorial is not None and found.factorial.tolist() == bodies.get(better, [[101, 101], [101, 101]])
+    assert plan.same["theirs"] == [100, 101, 102] and len(plan.same["ours"]) == 3
+
+
+def test_pictures_are_compared_with_no_body_of_ours(failed: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Case, "width", 84 * 84)
+    for compare in (lambda: fit(failed), lambda: _factorial(_Plan(failed, 3), Experiments())):
+        with pytest.raises(CannotMeasure, match="pictures"):
+            compare()
+    with pytest.raises(CannotMeasure, match="one of this size"):
+        capacity(failed)
 
 
 def test_a_budget_that_is_too_small_for_runs_is_said() -> None:

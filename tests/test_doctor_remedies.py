@@ -101,14 +101,26 @@ def test_the_command_that_confirms_reach_mends_the_return(
 
 
 @pytest.mark.slow
-def test_the_line_of_stable_baselines_that_confirms_reach_mends_the_return(confirms: list[str]) -> None:
+def test_defaults_of_stable_baselines_are_named_reach_and_the_line_that_is_printed_mends_them(
+    confirms: list[str], tmp_path: Path
+) -> None:
+    """DQN as it comes, 50,000 steps on CartPole-v1: what the file says is what `confirms` was made of."""
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    env = gym.make("CartPole-v1")
+    env, path = gym.make("CartPole-v1"), tmp_path / "agent.zip"
+    as_it_comes = stable_baselines3.DQN("MlpPolicy", env, seed=0).learn(50_000)
+    as_it_comes.save(path)
+    report = examine(path, "CartPole-v1")
+    first = report.findings[0]
+    assert (first.id, first.grade, report.cause) == ("V5", "B", "algorithm") and report.seconds < 60
+    assert first.confirm.splitlines() == confirms
     called = {"DQN": lambda *given, **named: stable_baselines3.DQN(*given, seed=0, **named), "env": env}
-    model = eval(confirms[0], called)  # the line as it is printed
-    assert float(evaluate_policy(model, gym.make("CartPole-v1"), 20)[0]) > 300
+    mended = eval(first.confirm.splitlines()[0], called)  # the line as it is printed
+    before, after = (
+        float(evaluate_policy(model, gym.make("CartPole-v1"), 20)[0]) for model in (as_it_comes, mended)
+    )  # fmt: skip
+    assert before < 250 and after > 300
 
 
 # Environments that are at fault, each with a network that was trained in it.

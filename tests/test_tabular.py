@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from neuralq import rules
 from neuralq.exact import solve
 from neuralq.learners import ReplayLearner, ReplaySettings
-from neuralq.mdp import FiniteMDP
+from neuralq.mdp import AliasedMDP, FiniteMDP
 from neuralq.q import TableQ
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.tabular import (
@@ -362,20 +362,20 @@ def test_many_seeds_are_independent_and_threads_change_nothing() -> None:
 
 def test_states_that_look_alike_share_their_values() -> None:
     mdp = uneven(8)
-    same = [q_learning(compile_model(mdp, observations=seen), 800, 0.9, seed=1) for seen in (None, np.arange(6))]
+    same = [q_learning(source, 800, 0.9, seed=1) for source in (mdp, AliasedMDP(mdp, np.arange(6)))]
     assert np.array_equal(same[0].q, same[1].q, equal_nan=True)
     # A corridor of three that looks the same everywhere, −1 per step: with α = γ = 1 the one value falls by 1 with
     # every step, and is −1 after the last of an episode.
     walk = FiniteMDP.from_functions(
         3, 1, lambda s: [0], lambda s, a: [(1.0, min(s + 1, 2), -1.0, s == 2)], start=[1, 0, 0]
     )
-    model = compile_model(walk, observations=np.zeros(3, dtype=int))
+    model = compile_model(AliasedMDP(walk, np.zeros(3, dtype=int)))
     assert [float(q_learning(model, n, 1.0, step_size=1.0).q[0, 0]) for n in (1, 2, 3, 4)] == [-1.0, -2.0, -1.0, -2.0]
     assert q_learning(model, 30, 1.0, step_size=1.0).num_episodes == 10
     with pytest.raises(ValueError, match="other legal actions"):
-        compile_model(mdp, observations=np.zeros(6, dtype=int))
+        AliasedMDP(mdp, np.zeros(6, dtype=int))
     with pytest.raises(ValueError, match="6 whole numbers"):
-        compile_model(mdp, observations=np.zeros(5, dtype=int))
+        AliasedMDP(mdp, np.zeros(5, dtype=int))
 
 
 def test_frequencies_follow_the_model() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from neuralq.exact import solve
-from neuralq.mdp import FiniteMDP
+from neuralq.mdp import AliasedMDP, FiniteMDP
 from neuralq.tabular import (
     EpsilonGreedy,
     RunOptions,
@@ -186,7 +186,7 @@ def test_sarsa_lambda_finds_a_good_memoryless_policy_and_one_step_q_learning_doe
     seen = littmans_view(mdp)
     shortest = solve(mdp, 0.95).v[cells]
     assert np.isclose((1 + np.log(shortest) / np.log(0.95)).sum(), 404)
-    model = compile_model(mdp, observations=seen)
+    model = compile_model(AliasedMDP(mdp, seen))
     policy = EpsilonGreedy(0.2, 0.0, 900_000)
     followed = over_seeds(
         lambda seed: sarsa_lambda(

@@ -61,6 +61,13 @@ WITHOUT_MODEL = {
     "neuralq/Elevators-v0": Registration("neuralq_envs.elevators.environment", has_vector=False),
     # The repairs of 51 tasks are 50, those of 164 are 400.
     "neuralq/JobShop-v0": Registration("neuralq_envs.job_shop.env", has_vector=False, max_episode_steps=1000),
+    # What is observed is not the state, so that the model of the states is not one of what is observed.
+    "neuralq/LittmanMaze-v0": Registration(
+        "neuralq_envs.aliased", {"maze": "littman"}, has_vector=False, max_episode_steps=500
+    ),
+    "neuralq/McCallumMaze-v0": Registration(
+        "neuralq_envs.aliased", {"maze": "mccallum"}, has_vector=False, max_episode_steps=200
+    ),
     "neuralq/Obelix-v0": Registration("neuralq_envs.obelix", has_vector=False, max_episode_steps=100),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),

@@ -43,6 +43,7 @@ class Grid:
         goal_reward: of entering a goal, instead of ``step_reward``.
         trap_reward: of entering a trap, instead.
         cliff_reward: of falling off a cliff, instead.
+        bump_reward: of a move that a wall or the edge refuses, instead; None for ``step_reward``.
         wind: cells by which each column pushes up, one whole number per column; empty for none.
         slip: probability of going to one of the two neighbouring directions instead, half of it each.
         num_moves: 4, or 8 with diagonal moves (which may pass between two walls).
@@ -62,6 +63,7 @@ class Grid:
     goal_reward: float = 1.0
     trap_reward: float = -1.0
     cliff_reward: float = -1.0
+    bump_reward: float | None = None
     wind: tuple[int, ...] = ()
     slip: float = 0.0
     num_moves: int = 4
@@ -74,8 +76,8 @@ class Grid:
         check_fraction("slip", self.slip)
         check_choice("num_moves", self.num_moves, _COMPASS)
         check_choice("blocked", self.blocked, ("legal", "illegal"))
-        for name in ("step_reward", "goal_reward", "trap_reward", "cliff_reward"):
-            if not math.isfinite(getattr(self, name)):
+        for name in ("step_reward", "goal_reward", "trap_reward", "cliff_reward", "bump_reward"):
+            if getattr(self, name) is not None and not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
         if self.wind and len(self.wind) != self.num_columns:
             raise ValueError(f"wind must have {self.num_columns} numbers, one for each column, got {len(self.wind)}")
@@ -143,6 +145,28 @@ class Grid:
             action_names=ACTIONS[: self.num_moves],
         )
 
+    def percepts(self, num_neighbours: int = 4) -> NDArray[np.int64]:
+        r"""What each cell looks like from within, by which of its neighbours cannot be entered, ``[S]``.
+
+        Patterns are numbered in the order of the cells that first have them; goals and traps look free. Cells in which
+        nobody can be are given 0.
+
+        Args:
+            num_neighbours: 4, or 8 with those at the corners.
+
+        Example:
+            >>> Grid("...\n.#.\n..G").percepts().tolist()
+            [0, 1, 2, 3, 0, 3, 4, 1, 5]
+        """
+        check_choice("num_neighbours", num_neighbours, _COMPASS)
+        patterns: dict[tuple[bool, ...], int] = {}
+        seen = np.zeros(len(self.signs), dtype=np.int64)
+        for s, sign in enumerate(self.signs):
+            if sign not in "#x":
+                pattern = tuple(self._neighbour(s, move) is None for move in _MOVES[:num_neighbours])
+                seen[s] = patterns.setdefault(pattern, len(patterns))
+        return seen
+
     def env(self, render_mode: str | None = None) -> RenderedEnv:
         """The grid as an environment.
 
@@ -174,7 +198,8 @@ class Grid:
             s_t = s_t if blown is None else blown
         if self.signs[s_t] == "C":
             return self.signs.index("S"), self.cliff_reward, False
-        reward = {"G": self.goal_reward, "T": self.trap_reward}.get(self.signs[s_t], self.step_reward)
+        step_reward = self.step_reward if stepped is not None or self.bump_reward is None else self.bump_reward
+        reward = {"G": self.goal_reward, "T": self.trap_reward}.get(self.signs[s_t], step_reward)
         return s_t, reward, self.signs[s_t] in "GT"
 
     def _neighbour(self, s: int, move: tuple[int, int]) -> int | None:

@@ -16,7 +16,7 @@ from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
 from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
-from neuralq.doctor.play import Clock, EnvironmentRaised, returns_from
+from neuralq.doctor.play import Clock, EnvironmentRaised
 from neuralq.doctor.report import Report
 from neuralq.doctor.subject import Settings, Subject, with_settings
 from neuralq.doctor.tree import decide
@@ -52,7 +52,9 @@ _MEASUREMENTS: dict[str, Measurement] = {
     "D1": stored.merged_ends,
     "D2": stored.reset_leak,
     "D3": stored.window,
+    "D3a": stored.few_batches,
     "D4": stored.actions_taken,
+    "D4a": stored.greedy_only,
     "D5": stored.rewards_seen,
     "R6": network.lag,
     "R6a": network.untouched,
@@ -93,8 +95,8 @@ def examine(
             by default.
         gamma: γ; by default what the file says, else 0.99.
         data: what was learned from: the path of an ``.npz``, "minari:ID" of a data set of Minari's (extra minari), or a
-            mapping of the columns ``obs, action, reward, terminated, truncated, next_obs`` and perhaps ``age``; or laid
-            out as D4RL's. By default what a neuralq run keeps in its replay.
+            mapping of the columns ``obs, action, reward, terminated, truncated, next_obs`` and perhaps ``age`` and
+            ``action_mask``; or laid out as D4RL's. By default what a neuralq run keeps in its replay.
         settings: of the training, where the file does not say: fields of `Settings`, such as
             ``{"target_period_updates": 500, "updates": 50_000}``.
         net: "module:Class" of a network that a state dict belongs to.
@@ -214,7 +216,9 @@ def _columns(data: Any) -> dict[str, Array] | None:
     if isinstance(data, str | Path):
         data = read_arrays(plain_bytes(Path(data)), str(data))
     if isinstance(data, Mapping):
-        return stored.of_recorded(recorded_from(data)) if "observations" in data else stored.check_columns(data)
+        if "observations" in data:
+            return stored.of_recorded(recorded_from(data), data.get("action_mask"))
+        return stored.check_columns(data)
     raise ValueError(f"data must be the path of an .npz or a mapping of columns, got {type(data).__name__}")
 
 
@@ -258,7 +262,7 @@ def _drawn(case: Case) -> dict[str, Array]:
     """Points for the page: Q and G of greedy steps, and Q at the start beside the return."""
     rng, pairs, starts = case.rng(99), [], []
     for one in case.greedy:
-        returns = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        returns = case.returns(one)
         if len(returns):
             q = one.values[np.arange(len(returns)), one.actions[: len(returns)]]
             pairs.append(np.column_stack([returns, q]))

@@ -165,10 +165,9 @@ def fit(case: Case, seeds: int = 3) -> Finding:
     network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
     if network is None or encode is None or outputs is None:
         raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
+    _refuse_pictures(case)
     s, a, g, names = labelled(case, 4000)
     x = case.world.as_rows(s)
-    if x.shape[1] > 2000:
-        raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
     ours = torch.as_tensor((x - x.mean(0)) / np.where(x.std(0) > 1e-12, x.std(0), 1.0)).float()
     theirs = encode(s)
     gaps, scores = [], []
@@ -192,6 +191,11 @@ def fit(case: Case, seeds: int = 3) -> Finding:
         "a wider body with LayerNorm, and observations scaled to about ±1",
         f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
     )  # fmt: skip
+
+
+def _refuse_pictures(case: Case) -> None:
+    if case.width > 2000:
+        raise CannotMeasure("observations are pictures, for which no network of ours is tried here")
 
 
 def _our_body(width: int, num_actions: int, rng: np.random.Generator) -> nn.Module:
@@ -226,8 +230,8 @@ def _repair(case: Case, one: Finding) -> _Repair | None:
         "V4": ("the target network copied every 500 updates", {"target_period_updates": 500}, None),
         "V5": (in_words(further), further, None),
         "V2": ("double Q-learning", {"target_rule": "double"}, None),
-        "D3": ("a buffer of 50,000 steps", {"capacity": 50_000}, None),
-        "D4": ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None),
+        **dict.fromkeys(("D3", "D3a"), ("a buffer of 50,000 steps", {"capacity": 50_000}, None)),
+        **dict.fromkeys(("D4", "D4a"), ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None)),
         "E4": ("observations normalised", {}, lambda: _normalised(case, make())),
         "E5": ("rewards of at most 1", {}, lambda: TransformReward(make(), lambda r: float(r) / case.largest_reward)),
     }
@@ -332,8 +336,9 @@ def _difference(more: Sequence[float], less: Sequence[float]) -> tuple[float, fl
 
 
 def _factorial(plan: _Plan, found: Experiments) -> list[Finding]:
-    steps = plan.steps_for(4 * plan.seeds)
     case = plan.case
+    _refuse_pictures(case)
+    steps = plan.steps_for(4 * plan.seeds)
     ours = {"learner": "rollout", "normalise_observations": False}
     wide = {"hidden": _OUR_HIDDEN, "layer_norm": True}
     normalised: Maker | None = None if case.world.is_discrete else lambda: _normalised(case, case.world.make())

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from neuralq.doctor.worlds import World
+from neuralq.runs.stream import legal_actions
 from neuralq.types import Array, Floats, Indices
 
 __all__ = ["Clock", "EnvironmentRaised", "Episode", "horizon", "legal_in", "play", "returns_from"]
@@ -61,7 +62,7 @@ class Episode:
         terminated: whether the world ended it.
         truncated: whether the environment cut it short.
         within: steps that lie within the environment's own limit, T where there is none.
-        legal: which actions ``info["action_mask"]`` allows, ``[T + 1, A]`` bool; None where none is ever given.
+        legal: which actions are legal, ``[T + 1, A]`` bool; None where the environment has no masks.
     """
 
     observations: Array
@@ -120,23 +121,24 @@ def returns_from(episode: Episode, gamma: float, rest: float = 0.05) -> Floats:
     return returns[: min(known, episode.within)]
 
 
-def legal_in(info: Mapping[str, Any], num_actions: int) -> Array:
-    """Which actions ``info["action_mask"]`` allows, ``[A]`` bool; all where there is none, or none is allowed.
+def legal_in(env: gym.Env[Any, Any], info: Mapping[str, Any], num_actions: int) -> Array:
+    """Which actions ``info["action_mask"]``, or a method, allows, ``[A]`` bool; all where neither allows any.
 
     Raises:
         EnvironmentRaised: the mask is not of this length.
 
     Example:
-        >>> legal_in({"action_mask": [1, 0]}, 2).tolist(), legal_in({}, 2).tolist()
+        >>> env = gym.make("CartPole-v1")
+        >>> legal_in(env, {"action_mask": [1, 0]}, 2).tolist(), legal_in(env, {}, 2).tolist()
         ([True, False], [True, True])
     """
-    if "action_mask" not in info:
+    told = legal_actions(env, info)
+    if told is None:
         return np.ones(num_actions, bool)
-    legal: Array = np.asarray(info["action_mask"]) != 0
+    legal: Array = np.asarray(told) != 0
     if legal.shape != (num_actions,):
-        raise EnvironmentRaised(
-            f"info['action_mask'] has the shape {list(legal.shape)}, and there are {num_actions} actions"
-        )
+        shape = list(legal.shape)
+        raise EnvironmentRaised(f"the action mask has the shape {shape}, and there are {num_actions} actions")
     return legal if legal.any() else ~legal
 
 
@@ -203,8 +205,8 @@ class _Running:
             first, info = env.reset(seed=seed)
         except Exception as error:
             raise EnvironmentRaised(f"reset raised {type(error).__name__}: {error}") from error
-        self.masked = "action_mask" in info
-        self.legal: list[Array] = [legal_in(info, num_actions)]
+        self.masked = legal_actions(env, info) is not None
+        self.legal: list[Array] = [legal_in(env, info, num_actions)]
         self.observations: list[Array] = [np.array(first)]
         self.actions: list[int] = []
         self.rewards: list[float] = []
@@ -220,7 +222,7 @@ class _Running:
             observation, reward, terminated, truncated, info = self.env.step(action + first_action)
         except Exception as error:
             raise EnvironmentRaised(f"step({action + first_action}) raised {type(error).__name__}: {error}") from error
-        self.legal.append(legal_in(info, self.num_actions))
+        self.legal.append(legal_in(self.env, info, self.num_actions) if self.masked else self.legal[-1])
         self.observations.append(np.array(observation))
         self.actions.append(action)
         self.rewards.append(float(reward))

@@ -2,7 +2,8 @@
 
 Arguments with one meaning in all of them:
 
-* ``source``: a `FiniteMDP`, a compiled `Model`, or a Gymnasium environment with finite spaces (slower);
+* ``source``: a `FiniteMDP`, an `AliasedMDP` (tables are then over its observations), a compiled `Model`, or a Gymnasium
+  environment with finite spaces (slower);
 * ``num_steps``: transitions of the source to learn from; ``gamma``: γ in [0, 1];
 * ``policy``: how to act, a setting or its name; a replayed expected Sarsa takes its expectation, nothing else does;
 * ``step_size``: α by the updates that a pair has had, real or imagined, counted from 0 in every call;

@@ -17,7 +17,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike, NDArray
 
 from neuralq.checks import check_choice, check_discount, check_whole
-from neuralq.mdp import FiniteMDP
+from neuralq.mdp import AliasedMDP, FiniteMDP
 from neuralq.tabular.kernels.acting import EPISODES, FORGET, RECORD, REPLAY, Log, Table, Walk, new_log, new_walk
 from neuralq.tabular.kernels.random_numbers import Seed
 from neuralq.tabular.learner import Learner
@@ -27,7 +27,7 @@ from neuralq.tabular.walking import EnvironmentWalk, WalkFault, state_reader
 
 __all__ = ["RunOptions", "learn", "log_of", "new_table", "replay", "table_from"]
 
-Source = FiniteMDP | Model | gymnasium.Env[Any, Any]
+Source = FiniteMDP | AliasedMDP | Model | gymnasium.Env[Any, Any]
 """What can be learned on: a model, the same compiled once for many runs, or an environment with finite spaces."""
 
 
@@ -82,7 +82,7 @@ def new_table(source: Source, options: RunOptions) -> tuple[Table, Source]:
         >>> table.q.tolist()
         [[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]]
     """
-    if isinstance(source, FiniteMDP):
+    if isinstance(source, FiniteMDP | AliasedMDP):
         source = compile_model(source, options.restarts)
     elif options.restarts != "model":
         raise ValueError(

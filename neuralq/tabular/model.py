@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from neuralq.checks import check_choice
 from neuralq.jit import lean_kernel
-from neuralq.mdp import FiniteMDP
+from neuralq.mdp import AliasedMDP, FiniteMDP
 from neuralq.mdp.outcomes import Outcomes
 
 __all__ = ["Model", "ModelArrays", "compile_model", "complete_outcomes", "empty_arrays"]
@@ -53,18 +53,17 @@ class Model:
     max_outcomes: int
 
 
-def compile_model(mdp: FiniteMDP, restarts: str = "model", observations: ArrayLike | None = None) -> Model:
+def compile_model(source: FiniteMDP | AliasedMDP, restarts: str = "model") -> Model:
     """The alias tables of a model.
 
     Args:
-        mdp: the model.
+        source: the model. Of an `AliasedMDP` the learner sees observations: tables are over these, and states that
+            look alike share their values.
         restarts: episodes begin in a state drawn from the model's start distribution (``"model"``) or uniformly from
             all states that have an action (``"uniform"``).
-        observations: what the learner sees of each state, whole numbers ``[S]``: tables are then over observations, and
-            states that look alike share their values (hidden state). None to see the state itself.
 
     Raises:
-        ValueError: another ``restarts``, or states that look alike but have different actions.
+        ValueError: another ``restarts``.
 
     Example:
         >>> model = compile_model(FiniteMDP.garnet(4, 2, 3, seed=0))
@@ -72,6 +71,7 @@ def compile_model(mdp: FiniteMDP, restarts: str = "model", observations: ArrayLi
         (3, [0, 3, 6])
     """
     check_choice("restarts", restarts, RESTARTS)
+    mdp = source.mdp if isinstance(source, AliasedMDP) else source
     outcomes = complete_outcomes(mdp)
     pair, probability = (mdp.s_tm1 * mdp.num_actions + mdp.a_tm1)[outcomes.row], outcomes.probability
     first = np.searchsorted(pair, np.arange(mdp.num_states * mdp.num_actions + 1))
@@ -87,25 +87,11 @@ def compile_model(mdp: FiniteMDP, restarts: str = "model", observations: ArrayLi
         start_keep, start_alias, states.astype(unsigned), np.zeros(0, unsigned),
     )  # fmt: skip
     room = int(np.max(np.diff(first)))
-    if observations is None:
+    if isinstance(source, FiniteMDP):
         return Model(arrays, mdp.legal, room)
-    seen, legal = _observed(mdp, np.asarray(observations))
     # A pair of observations can lead wherever any of its states does.
-    room *= int(np.max(np.bincount(seen)))
-    return Model(arrays._replace(observe=seen.astype(unsigned)), legal, room)
-
-
-def _observed(mdp: FiniteMDP, observations: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The observation of each state and the legal actions of each observation."""
-    if observations.shape != (mdp.num_states,) or observations.dtype.kind not in "iu" or observations.min() < 0:
-        raise ValueError(f"observations must be {mdp.num_states} whole numbers from 0, one per state")
-    legal = np.zeros((int(observations.max()) + 1, mdp.num_actions), dtype=bool)
-    lively = np.flatnonzero(~mdp.is_terminal)
-    legal[observations[lively]] = mdp.legal[lively]
-    bad = lively[(legal[observations[lively]] != mdp.legal[lively]).any(axis=1)]
-    if bad.size:
-        raise ValueError(f"{mdp.state_name(bad[0])} looks like a state with other legal actions")
-    return observations.astype(np.int64), legal
+    room *= int(np.max(np.bincount(source.observation)))
+    return Model(arrays._replace(observe=source.observation.astype(unsigned)), source.legal, room)
 
 
 def empty_arrays() -> ModelArrays:

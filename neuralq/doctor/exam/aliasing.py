@@ -74,9 +74,8 @@ def _rows(case: Case) -> tuple[Floats, Floats, Floats, Array]:
     episodes = [one for one in (*case.explored, *case.chance, *case.greedy[:20]) if one.length >= 3]
     if len(episodes) < _FEWEST_EPISODES:
         raise CannotMeasure(f"it takes {_FEWEST_EPISODES} episodes of at least 3 steps, there were {len(episodes)}")
-    width = int(np.prod(case.world.as_rows(episodes[0].observations[:1]).shape[1:]))
-    if width > _MOST_WIDTH:
-        raise CannotMeasure(f"observations of {width:,} numbers; up to {_MOST_WIDTH} are regressed on")
+    if case.width > _MOST_WIDTH:
+        raise CannotMeasure(f"observations of {case.width:,} numbers; up to {_MOST_WIDTH} are regressed on")
     actions = np.eye(case.world.num_actions)
     now, past, ahead, names = [], [], [], []
     each = max(5, _MOST_ROWS // len(episodes))

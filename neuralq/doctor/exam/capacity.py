@@ -18,7 +18,6 @@ from neuralq.doctor.estimates import bounds_of, held_out_scores
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.exam.signs import fresh, hidden
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import returns_from
 from neuralq.types import Array, Floats
 
 __all__ = ["capacity", "labelled", "regressed", "t_interval"]
@@ -33,11 +32,10 @@ def capacity(case: Case) -> Finding:
     network, encode, outputs = case.subject.network, case.subject.encode, case.subject.outputs
     if network is None or encode is None or outputs is None:
         raise CannotMeasure("the subject is a function, whose architecture is not known; hand over the torch.nn.Module")
-    s, a, g, names = labelled(case, _NUM_ROWS)
-    x = case.world.as_rows(s)
-    if x.shape[1] > _MOST_WIDTH or sum(p.numel() for p in network.parameters()) > _MOST_WEIGHTS:
+    if case.width > _MOST_WIDTH or sum(p.numel() for p in network.parameters()) > _MOST_WEIGHTS:
         raise CannotMeasure("it trains fresh networks, which the budget does not allow for one of this size")
-    theirs, with_action = encode(s), np.concatenate([x, np.eye(case.world.num_actions)[a]], axis=1)
+    s, a, g, names = labelled(case, _NUM_ROWS)
+    theirs, with_action = encode(s), np.concatenate([case.world.as_rows(s), np.eye(case.world.num_actions)[a]], axis=1)
     divisions = []
     for seed in range(_SEEDS):
         rng = case.rng(320 + seed)
@@ -97,7 +95,7 @@ def labelled(case: Case, most: int) -> tuple[Array, Array, Floats, Array]:
     """
     rows = []
     for i, one in enumerate((*case.greedy, *case.explored)):
-        g = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        g = case.returns(one)
         if len(g):
             rows.append((one.observations[: len(g)], one.actions[: len(g)], g, np.full(len(g), i)))
     if len(rows) < 9:

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Clock, Episode, horizon, play
+from neuralq.doctor.play import Clock, Episode, horizon, play, returns_from
 from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
@@ -62,6 +62,16 @@ class Case:
         return np.random.default_rng([self.seed, number])
 
     @property
+    def masked(self) -> bool:
+        """Whether the environment says which actions are legal."""
+        return self.greedy[0].legal is not None
+
+    @property
+    def width(self) -> int:
+        """Numbers of an observation as a row for regressions."""
+        return int(self.world.as_rows(self.greedy[0].observations[:1]).shape[1])
+
+    @property
     def episodes(self) -> list[Episode]:
         """Of every policy."""
         return [*self.greedy, *self.explored, *self.chance, *(one for all_ in self.constant.values() for one in all_)]
@@ -75,6 +85,10 @@ class Case:
     def largest_reward(self) -> float:
         """Max |r| seen."""
         return max((float(np.abs(one.rewards).max()) for one in self.episodes), default=0.0)
+
+    def returns(self, one: Episode) -> Floats:
+        """G of its steps whose return is known, ``[n]``: to 1 % where episodes go on past the limit, else to 5 %."""
+        return returns_from(one, self.gamma, 0.01 if self.world.liftable else 0.05)
 
     @property
     def horizon(self) -> int:

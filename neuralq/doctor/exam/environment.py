@@ -29,8 +29,8 @@ _CONFIRM_CHECK = (
 
 def contract(case: Case) -> Finding:
     """E1: Gymnasium's checker, NaN, and observations outside their space."""
-    masked = case.greedy[0].legal is not None  # checkers try actions that are illegal
-    problem = _broken_numbers(case.episodes) or _outside(case) or (None if masked else _checked(case))
+    problem = _broken_numbers(case.episodes) or _outside(case)
+    problem = problem or (None if case.masked else _checked(case))  # checkers try actions that are illegal
     return Finding(
         "E1", "the environment breaks its contract", "environment", "B", float(problem is not None), None, 0.5,
         "Gymnasium's contract: any fault counts", problem is not None,
@@ -41,7 +41,7 @@ def contract(case: Case) -> Finding:
 
 
 def _checkers(case: Case) -> str:
-    if case.greedy[0].legal is not None:
+    if case.masked:
         return "what was played (checkers would try illegal actions)"
     return "Gymnasium's checker" + (" and Stable-Baselines3's" if _second_checker(case) is not None else "")
 
@@ -109,7 +109,7 @@ def determinism(case: Case) -> Finding:
             s, info = env.reset(seed=case.seed)
             trace = [np.asarray(s).tobytes()]
             for _ in range(200):
-                a = int(any_of(legal_in(info, world.num_actions)[None], rng)[0])
+                a = int(any_of(legal_in(env, info, world.num_actions)[None], rng)[0])
                 s, r, terminated, truncated, info = env.step(a + world.first_action)
                 trace += [np.asarray(s).tobytes(), np.float64(r).tobytes()]
                 if terminated or truncated:
@@ -172,6 +172,8 @@ def _limit_finding(auc: float, longest: int, said: str, drift: float = 0.0) -> F
 
 def _told_apart(case: Case, episodes: Sequence[Episode], step: int) -> float:
     """How well the observation at a step is told from the few before it, by AUC."""
+    if case.width > 2000:
+        raise CannotMeasure("observations of more than 2,000 numbers are not regressed on")
     rng = case.rng(3)
     rows, labels, names = [], [], []
     for i, one in enumerate(episodes):
@@ -180,8 +182,6 @@ def _told_apart(case: Case, episodes: Sequence[Episode], step: int) -> float:
         labels += [1.0, *[0.0] * len(earlier)]
         names += [i] * (1 + len(earlier))
     x, y = case.world.as_rows(np.stack(rows)), np.array(labels)
-    if x.shape[1] > 2000:
-        raise CannotMeasure("observations of more than 2,000 numbers are not regressed on")
     return area_under_curve(held_out_scores(x, y[:, None], np.array(names), rng)[:, 0], y > 0)
 
 

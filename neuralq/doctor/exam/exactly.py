@@ -74,7 +74,7 @@ def _values(case: Case) -> tuple[FiniteMDP, np.ndarray[tuple[int, ...], np.dtype
 def _legal(case: Case, model: FiniteMDP) -> Array:
     """The model's legal actions, less those that masks forbid: where a state was met, or the environment says it."""
     legal = model.legal.copy()
-    if case.greedy[0].legal is None:
+    if not case.masked:
         return legal
     env = case.world.make()
     asked = getattr(env.unwrapped, "action_mask", None)  # as Taxi has it

@@ -56,7 +56,7 @@ def _with_mask(case: Case, observations: Array, legal: Array | None) -> Tensor:
 
 def _legal_only(case: Case, outputs: Outputs) -> Outputs:
     """The outputs for what `_with_mask` gives, −∞ for illegal actions."""
-    if case.greedy[0].legal is None:
+    if not case.masked:
         return outputs
     assert case.subject.encode is not None
     shape = case.subject.encode(case.greedy[0].observations[:1]).shape[1:]
@@ -214,7 +214,7 @@ def lag(case: Case) -> Finding:
     (network, outputs), x = _network(case), _encoded(case, _NUM_STATES, 30)
     if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
         return Finding(
-            "R6", "the weights are not finite", "algorithm", "B", float("nan"), None, 0.5, "any", True,
+            "R6", "the weights are not finite", "algorithm", "B", float("nan"), None, None, "any", True,
             "some weights are NaN or infinite", "a smaller step size, and gradients clipped", "train again with lr "
             "/ 10",
         )  # fmt: skip

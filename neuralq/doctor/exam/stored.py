@@ -1,8 +1,8 @@
 """D1–D5: the experience that was learned from.
 
-Columns of the ``.npz``: ``obs, action, reward, terminated, truncated, next_obs`` in the order of time,
-one environment's
-rows after each other; ``age`` where rows are not in that order.
+Columns of the ``.npz``: ``obs, action, reward, terminated, truncated, next_obs`` in the order of time, one
+environment's rows after each other; ``age`` where rows are not in that order. Where actions are masked, ``action_mask``
+says which were legal at ``obs``, and ``next_action_mask`` at ``next_obs``; without it the next row's mask is taken.
 """
 
 from __future__ import annotations
@@ -14,11 +14,23 @@ import numpy as np
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.findings import Finding, Grade
 from neuralq.runs.offline.recorded import Recorded
-from neuralq.types import Array
+from neuralq.types import Array, Indices
 
-__all__ = ["actions_taken", "check_columns", "merged_ends", "of_recorded", "reset_leak", "rewards_seen", "window"]
+__all__ = [
+    "actions_taken",
+    "check_columns",
+    "few_batches",
+    "greedy_only",
+    "legal_in_data",
+    "merged_ends",
+    "of_recorded",
+    "reset_leak",
+    "rewards_seen",
+    "window",
+]
 
 COLUMNS = ("obs", "action", "reward", "terminated", "truncated", "next_obs")
+_MASKS = ("action_mask", "next_action_mask")
 
 
 def check_columns(stored: Mapping[str, Array]) -> dict[str, Array]:
@@ -36,23 +48,29 @@ def check_columns(stored: Mapping[str, Array]) -> dict[str, Array]:
     for name in COLUMNS:
         if name not in stored:
             raise ValueError(f"the data lack the column {name!r}; write it with {write}")
-    num = len(stored["reward"])
-    for name in COLUMNS:
+    num, names = len(stored["reward"]), [*COLUMNS, *(name for name in _MASKS if name in stored)]
+    for name in names:
         if len(stored[name]) != num or num == 0:
             raise ValueError(f"the column {name!r} has {len(stored[name])} rows and 'reward' {num}; write {write}")
-    found = {name: np.asarray(stored[name]) for name in COLUMNS}
+    found = {name: np.asarray(stored[name]) for name in names}
     for name in ("action", "reward", "terminated", "truncated"):
         found[name] = found[name].reshape(num)
     order = np.argsort(np.asarray(stored["age"]).reshape(num))[::-1] if "age" in stored else np.arange(num)
     return {name: column[order] for name, column in found.items()}
 
 
-def of_recorded(given: Recorded) -> dict[str, Array]:
-    """The columns of a record, without the steps of which nobody knows what came next."""
+def of_recorded(given: Recorded, masks: Array | None = None) -> dict[str, Array]:
+    """The columns of a record, without the steps of which nobody knows what came next.
+
+    Args:
+        given: the record.
+        masks: which actions were legal, ``[N, A]``; None where nothing says so.
+    """
     columns = (
         given.observations, given.actions, given.rewards, given.terminations, given.truncations, given.successors
     )  # fmt: skip
-    return {name: column[given.known] for name, column in zip(COLUMNS, columns, strict=True)}
+    found = dict(zip(COLUMNS, columns, strict=True)) | ({} if masks is None else {"action_mask": masks})
+    return {name: column[given.known] for name, column in check_columns(found).items()}
 
 
 def _stored(case: Case) -> Mapping[str, Array]:
@@ -68,6 +86,34 @@ def _lengths(stored: Mapping[str, Array]) -> tuple[Array, Array]:
     last = np.flatnonzero(ends | np.append(~same, True))
     lengths = np.diff(np.concatenate([[-1], last]))
     return lengths, last
+
+
+def legal_in_data(case: Case) -> tuple[Array, Array] | None:
+    """Which actions were legal in each row and in what it led to, ``[N, A]`` bool; none in what nobody knows.
+
+    Returns:
+        None where neither the data nor the environment know of masks.
+
+    Raises:
+        CannotMeasure: the environment masks actions and the data do not say which were legal.
+    """
+    stored, num = _stored(case), case.world.num_actions
+    if "action_mask" not in stored:
+        if not case.masked:
+            return None
+        raise CannotMeasure(
+            "the environment masks actions, and the data do not say which were legal; add a column action_mask, [N, A]"
+        )
+    for name in (name for name in _MASKS if name in stored):
+        if stored[name].shape[1:] != (num,):
+            shape = list(stored[name].shape[1:])
+            raise CannotMeasure(f"a row of the column {name} has the shape {shape}, and there are {num} actions")
+    now = stored["action_mask"] != 0
+    if "next_action_mask" in stored:
+        return now, stored["next_action_mask"] != 0
+    goes_on = np.ones(len(now), bool)
+    goes_on[_lengths(stored)[1]] = False
+    return now, np.roll(now, -1, axis=0) & goes_on[:, None]
 
 
 def merged_ends(case: Case) -> Finding:
@@ -126,38 +172,66 @@ def window(case: Case) -> Finding:
     )  # fmt: skip
 
 
+def few_batches(case: Case) -> Finding:
+    """D3a: how many batches the replay buffer holds, as the settings say."""
+    capacity, batch = case.settings.capacity, case.settings.batch_size
+    if capacity is None or not batch:
+        raise CannotMeasure("the size of the buffer or of a batch is not known (--set capacity=N --set batch_size=N)")
+    return Finding(
+        "D3a", "the buffer holds hardly more than a batch", "data", "B", capacity / batch, None, 10.0, "our own",
+        capacity < 10 * batch,
+        f"the buffer holds {capacity:,.0f} steps and a batch is {batch:,.0f}: updates see the latest steps alone, and "
+        "what was learned of others is lost",
+        "a larger buffer: 10,000 steps and more", f"neuralq train {case.world.name} --learner replay --capacity 50000",
+    )  # fmt: skip
+
+
+def greedy_only(case: Case) -> Finding:
+    """D4a: whether the settings let anything but the greedy action be tried."""
+    first, last = case.settings.epsilon_start, case.settings.epsilon_end
+    if first is None or last is None:
+        raise CannotMeasure("how it explored is not known (--set epsilon_start=E --set epsilon_end=E)")
+    return Finding(
+        "D4a", "nothing was explored", "data", "B", max(first, last), None, 0.0, "any", first == last == 0,
+        f"ε went from {first:g} to {last:g}"
+        + ("" if first or last else ": nothing but the greedy action was ever tried, and better ones stay unseen"),
+        "explore: ε from 1 down to 0.05, over a tenth of training or more",
+        "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
+    )  # fmt: skip
+
+
 def actions_taken(case: Case) -> Finding:
-    """D4: how much of every action there is; where no data are given, what exploration the settings allowed."""
+    """D4: how much of every action there is, in the data or else in greedy episodes."""
     num = case.world.num_actions
     grade: Grade
     if case.stored is not None:
         index = np.asarray(case.stored["action"], np.int64) - case.world.first_action
-        counts = np.bincount(np.clip(index, 0, num - 1), minlength=num)
+        legal = legal_in_data(case)
+        counts = _chosen(np.clip(index, 0, num - 1), None if legal is None else legal[0], num)
         said, grade = "in the data", "B"
-    elif case.settings.epsilon_start == 0 and case.settings.epsilon_end == 0:
-        return _exploration(
-            "B", 1.0, "the settings say ε = 0 from first to last: nothing but the greedy action was ever tried"
-        )
     else:
-        counts = np.bincount(np.concatenate([one.actions for one in case.greedy]), minlength=num)
+        masks = [one.legal[:-1] for one in case.greedy if one.legal is not None]
+        taken = np.concatenate([one.actions for one in case.greedy])
+        counts = _chosen(taken, np.concatenate(masks) if masks else None, num)
         said, grade = "in greedy episodes", "C"
     share = counts / counts.sum()
     most = float(share.max())
     kept = share[share > 0]
     entropy = float(-(kept * np.log(kept)).sum() / np.log(num)) if num > 1 else 1.0
-    return _exploration(
-        grade,
-        most,
-        f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most",
-    )
-
-
-def _exploration(grade: Grade, most: float, said: str) -> Finding:
     return Finding(
-        "D4", "hardly any action but one is tried", "data", grade, most, None, 0.95, "our own", most > 0.95, said,
+        "D4", "hardly any action but one is tried", "data", grade, most, None, 0.95, "our own", most > 0.95,
+        f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most",
         "explore more: ε from 1 down to 0.05, over a tenth of training or more",
         "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
     )  # fmt: skip
+
+
+def _chosen(actions: Indices, legal: Array | None, num: int) -> Indices:
+    """How often each action was taken where there was a choice, ``[A]``."""
+    chosen = actions if legal is None else actions[legal.sum(1) > 1]
+    if not len(chosen):
+        raise CannotMeasure("nowhere was more than one action legal")
+    return np.bincount(chosen, minlength=num)
 
 
 def rewards_seen(case: Case) -> Finding:

@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 
 from neuralq.doctor.estimates import bounds_of, rank_correlation
-from neuralq.doctor.exam.case import CannotMeasure, Case, any_of, greedy_of, stacked
+from neuralq.doctor.exam.case import CannotMeasure, Case, greedy_of, legal_at, stacked
 from neuralq.doctor.exam.retraining import further_reach, in_words, retrained
+from neuralq.doctor.exam.stored import legal_in_data
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Episode, legal_in, returns_from
+from neuralq.doctor.play import Episode, legal_in
 from neuralq.types import Array, Floats
 
 __all__ = ["better_actions", "bias", "generalisation", "has_learned", "rank", "reach", "soft_divergence"]
+
+
+_BIAS, _EXCESS, _REACH, _RANK, _WORSE, _FRESH = 0.1, 1.1, 0.9, 0.3, 0.2, 2.0
+"""Thresholds of V2, V4, V5, V6, V6a and V8."""
 
 
 def has_learned(case: Case) -> Finding:
@@ -54,7 +59,7 @@ def on_policy(case: Case, episodes: Sequence[Episode] | None = None) -> list[tup
     """
     found = []
     for one in case.greedy if episodes is None else episodes:
-        returns = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        returns = case.returns(one)
         if len(returns):
             n = len(returns)
             found.append((one.values[np.arange(n), one.actions[:n]], returns))
@@ -79,13 +84,13 @@ def bias(case: Case) -> Finding:
 
     value = float(share(sums.sum(0)[None])[0])
     low, high = bounds_of(sums, share, case.rng(12))
-    off = low > 0.1 or high < -0.1
+    off = low > _BIAS or high < -_BIAS
     mean_q, mean_g = (float(np.concatenate([p[k] for p in pairs]).mean()) for k in (0, 1))
     way = "over" if value > 0 else "under"
     said = f"values average {mean_q:.4g} where {mean_g:.4g} was returned, {100 * abs(value):.3g} % {way}"
     return Finding(
         "V2", "values are overestimated" if value > 0 else "values are underestimated", "algorithm", "B", value,
-        (low, high), 0.1, "our own; the quantity is that of REDQ (Chen et al. 2021)", off, said,
+        (low, high), _BIAS, "our own; the quantity is that of REDQ (Chen et al. 2021)", off, said,
         "double Q-learning, or a lower γ" if value > 0 else "see reach (V5) and the hypotheses (V3)",
         f"neuralq train {case.world.name} --learner replay --target-rule double"
         if value > 0 else f"neuralq train {case.world.name}  # λ-returns, which bootstrap less",
@@ -98,7 +103,7 @@ def soft_divergence(case: Case) -> Finding:
     values = np.concatenate([one.values[... if one.legal is None else one.legal[:-1]].reshape(-1) for one in pool])
     if not np.isfinite(values).all():
         return Finding(
-            "V4", "values are not finite", "algorithm", "B", float("nan"), None, 1.1, "any", True,
+            "V4", "values are not finite", "algorithm", "B", float("nan"), None, None, "any", True,
             "the network gives NaN or infinity", "a smaller step size, and gradients clipped", "train again with lr "
             "/ 10",
         )  # fmt: skip
@@ -109,9 +114,9 @@ def soft_divergence(case: Case) -> Finding:
     ratio = most / bound
     said = f"the largest |Q| is {most:.4g}, and no return can exceed {bound:.4g}"
     return Finding(
-        "V4", "values exceed every possible return", "algorithm", "B", ratio, None, 1.1, "van Hasselt et al. 2018",
-        ratio > 1.1,
-        said, "a target network that is copied less often, a smaller step size, and the end of episodes in the target",
+        "V4", "values exceed every possible return", "algorithm", "B", ratio, None, _EXCESS, "van Hasselt et al. 2018",
+        ratio > _EXCESS, said,
+        "a target network that is copied less often, a smaller step size, and the end of episodes in the target",
         f"neuralq train {case.world.name}  # λ-returns with LayerNorm; and neuralq lab prescribe",
     )  # fmt: skip
 
@@ -149,8 +154,7 @@ def reach(case: Case) -> Finding:
     changes = further_reach(case)
     return Finding(
         "V5", "values cannot see far enough: the target network was copied too seldom", "algorithm", "B", value, None,
-        0.9,
-        "our own; ρ = 1 − γ^(nK) was measured as predicted", value < 0.9, said,
+        _REACH, "our own; ρ = 1 − γ^(nK) was measured as predicted", value < _REACH, said,
         f"{in_words(changes)}; or λ-returns", _confirming_reach(case, changes),
     )  # fmt: skip
 
@@ -179,7 +183,7 @@ def rank(case: Case) -> Finding:
         raise CannotMeasure("returns hardly differ between states, so that there is no order to get right")
     rho = rank_correlation(q, g)
     return Finding(
-        "V6", "values do not order states by their returns", "algorithm", "C", rho, None, 0.3, "our own", rho < 0.3,
+        "V6", "values do not order states by their returns", "algorithm", "C", rho, None, _RANK, "our own", rho < _RANK,
         f"the rank correlation of values and returns is {rho:.2f}", "see the other findings", "plot Q against G: "
         "the page does",
     )  # fmt: skip
@@ -201,8 +205,8 @@ def better_actions(case: Case) -> Finding:
     low, high = bounds_of(np.column_stack([worse, np.ones(len(worse))]), lambda s: s[:, 0] / s[:, 1], case.rng(17))
     share = float(worse.mean())
     return Finding(
-        "V6a", "another action is better in many states", "algorithm", "B", share, (low, high), 0.2, "our own",
-        low > 0.2,
+        "V6a", "another action is better in many states", "algorithm", "B", share, (low, high), _WORSE, "our own",
+        low > _WORSE,
         f"in {int(worse.sum())} of {len(worse)} states another action returned significantly more than the greedy one",
         "the values order actions wrongly: train longer, explore more, or mend what the other findings name",
         f"neuralq train {case.world.name}  # and compare returns",
@@ -210,41 +214,52 @@ def better_actions(case: Case) -> Finding:
 
 
 _NUM_STATES, _REPEATS, _MOST_AHEAD = 24, 3, 300
+_FEW_STATES, _LARGE = 8, 10_000
+"""States where an observation has so many numbers: each is followed for thousands of steps, all through the network."""
 
 
-def _snapshots(case: Case) -> list[tuple[object, Array, Array]]:
+def _snapshots(case: Case) -> list[tuple[Any, Array, Array]]:
+    """Environments in states of ε-greedy episodes, played side by side, with what is seen there and which is legal."""
     rng, world = case.rng(16), case.world
-    lengths = [one.length for one in case.explored]
-    found: list[tuple[object, Array, Array]] = []
-    for i in range(_NUM_STATES):
-        env = world.make()
-        s, info = env.reset(seed=5000 + i)
-        for _ in range(int(rng.integers(0, max(int(np.median(lengths)) // 2, 1)))):
-            legal = legal_in(info, world.num_actions)[None]
-            a = int(greedy_of(case.subject.values(np.asarray(s)[None]), legal)[0])
-            a = int(any_of(legal, rng)[0]) if rng.random() < 0.1 else a
-            s, _, terminated, truncated, info = env.step(a + world.first_action)
-            if terminated or truncated:
-                s, info = env.reset()
-        try:
-            copy.deepcopy(env)
-        except Exception as error:
-            raise CannotMeasure(f"the environment cannot be copied ({type(error).__name__})") from error
-        found.append((env, np.asarray(s), legal_in(info, world.num_actions)))
-    return found
+    half = max(int(np.median([one.length for one in case.explored])) // 2, 1)
+    tried: list[list[int]] = []  # per state and step the action in place of the greedy one; −1 for none
+    for _ in range(_NUM_STATES if case.greedy[0].observations[0].size < _LARGE else _FEW_STATES):
+        steps = int(rng.integers(0, half))
+        tried.append([int(rng.integers(world.num_actions)) if rng.random() < 0.1 else -1 for _ in range(steps)])
+    envs = [world.make() for _ in tried]
+    told = [env.reset(seed=5000 + i) for i, env in enumerate(envs)]
+    for t in range(max(map(len, tried))):
+        going = [i for i, one in enumerate(tried) if t < len(one)]
+        legal = np.stack([legal_in(envs[i], told[i][1], world.num_actions) for i in going])
+        best = greedy_of(case.subject.values(np.stack([told[i][0] for i in going])), legal)
+        for i, a, allowed in zip(going, best.tolist(), legal, strict=True):
+            other = tried[i][t]
+            a = other if other >= 0 and allowed[other] else a
+            s, _, terminated, truncated, info = envs[i].step(a + world.first_action)
+            told[i] = envs[i].reset() if terminated or truncated else (s, info)
+    return [
+        (env, np.array(s), legal_in(env, info, world.num_actions)) for env, (s, info) in zip(envs, told, strict=True)
+    ]
 
 
-def _gains(case: Case, states: list[tuple[object, Array, Array]]) -> Floats:
+def _copied(env: Any) -> Any:
+    try:
+        return copy.deepcopy(env)
+    except Exception as error:
+        raise CannotMeasure(f"the environment cannot be copied ({type(error).__name__})") from error
+
+
+def _gains(case: Case, states: list[tuple[Any, Array, Array]]) -> Floats:
     """Discounted return of every action beside that of the greedy one, ``[states, actions, repeats]``; 0 if illegal."""
     world, num = case.world, case.world.num_actions
     legal = np.stack([mask for _, _, mask in states])
     greedy = greedy_of(case.subject.values(np.stack([s for _, s, _ in states])), legal)
-    envs, seen, total = [], [], np.zeros((len(states), num, _REPEATS))
+    envs, seen, total = list[Any](), list[Array](), np.zeros((len(states), num, _REPEATS))
     for env, s, _ in states:
         for _ in range(num):
             for j in range(_REPEATS):
-                one = copy.deepcopy(env)
-                one.unwrapped.np_random = np.random.default_rng(j)  # type: ignore[attr-defined]
+                one = _copied(env)
+                one.unwrapped.np_random = np.random.default_rng(j)
                 envs.append(one)
                 seen.append(s)
     allowed = np.repeat(legal, num * _REPEATS, axis=0)  # in what follows
@@ -252,11 +267,12 @@ def _gains(case: Case, states: list[tuple[object, Array, Array]]) -> Floats:
     actions = np.tile(np.repeat(np.arange(num), _REPEATS), len(states))
     for t in range(min(_MOST_AHEAD, case.horizon)):
         if t:
-            actions[going] = greedy_of(case.subject.values(np.stack([seen[i] for i in going])), allowed[going])
+            actions[going] = greedy_of(_values(case, [seen[i] for i in going]), allowed[going])
         still = []
         for i in going:
-            seen[i], r, terminated, truncated, info = envs[i].step(int(actions[i]) + world.first_action)  # type: ignore[attr-defined]
-            allowed[i] = legal_in(info, num)
+            seen[i], r, terminated, truncated, info = envs[i].step(int(actions[i]) + world.first_action)
+            if case.masked:
+                allowed[i] = legal_in(envs[i], info, num)
             flat[i] += case.gamma**t * float(r)
             if not (terminated or truncated):
                 still.append(i)
@@ -267,27 +283,46 @@ def _gains(case: Case, states: list[tuple[object, Array, Array]]) -> Floats:
     return np.where(legal[:, :, None], gains, 0.0)
 
 
+def _values(case: Case, seen: Sequence[Array]) -> Floats:
+    """Action values, of each observation once: copies that acted alike see the same."""
+    distinct = {np.asarray(s).tobytes(): s for s in seen}
+    places = {name: k for k, name in enumerate(distinct)}
+    return case.subject.values(np.stack(list(distinct.values())))[[places[np.asarray(s).tobytes()] for s in seen]]
+
+
 def generalisation(case: Case) -> Finding:
     """V8: the TD error on fresh experience over that on the data that was learned from (Li et al. 2023)."""
     stored = case.stored
     if stored is None:
         raise CannotMeasure("the data that was learned from was not given (--data file.npz)")
-    pick = case.rng(18).permutation(len(stored["reward"]))[:2000]
-    learned = _td_error(case, *(stored[k][pick] for k in ("obs", "action", "reward", "next_obs", "terminated")))
+    masks = legal_in_data(case)
+    known = (
+        np.ones(len(stored["reward"]), bool) if masks is None else stored["terminated"].astype(bool) | masks[1].any(1)
+    )
+    if not known.any():
+        raise CannotMeasure("of no stored step it is known which actions were legal after it")
+    pick = case.rng(18).permutation(np.flatnonzero(known))[:2000]
+    legal = None if masks is None else masks[1][pick]
+    learned = _td_error(case, legal, *(stored[k][pick] for k in ("obs", "action", "reward", "next_obs", "terminated")))
     s, a, r, s_t, ended, _ = stacked(case.explored)
     within = np.concatenate([np.arange(one.length) < one.within for one in case.explored])
     fresh_rows = case.rng(19).permutation(np.flatnonzero(within))[:2000]
-    fresh = _td_error(case, *(x[fresh_rows] for x in (s, a + case.world.first_action, r, s_t, ended)))
+    legal = legal_at(case.explored, fresh_rows, later=1)
+    fresh = _td_error(case, legal, *(x[fresh_rows] for x in (s, a + case.world.first_action, r, s_t, ended)))
     ratio = fresh / max(learned, 1e-12)
     return Finding(
-        "V8", "errors are larger on fresh experience", "data", "C", ratio, None, 2.0, "Li et al. 2023", ratio > 2,
+        "V8", "errors are larger on fresh experience", "data", "C", ratio, None, _FRESH, "Li et al. 2023",
+        ratio > _FRESH,
         f"the mean squared TD error is {fresh:.3g} on fresh experience and {learned:.3g} on the stored data",
         "a smaller network, fewer updates per step, or more data", "halve the updates per step, and compare",
     )  # fmt: skip
 
 
-def _td_error(case: Case, s: Array, a: Array, r: Array, s_t: Array, ended: Array) -> float:
+def _td_error(case: Case, legal: Array | None, s: Array, a: Array, r: Array, s_t: Array, ended: Array) -> float:
+    """The mean square over steps; ``legal`` says of which actions after them the best is meant."""
     index = np.asarray(a, np.int64).reshape(-1) - case.world.first_action
     q = case.subject.values(s)[np.arange(len(s)), index]
-    ahead = np.where(np.asarray(ended, bool).reshape(-1), 0.0, case.subject.values(s_t).max(1))
+    after = case.subject.values(s_t)
+    best = after.max(1) if legal is None else np.where(legal, after, -np.inf).max(1)
+    ahead = np.where(np.asarray(ended, bool).reshape(-1), 0.0, best)
     return float(((np.asarray(r, np.float64).reshape(-1) + case.gamma * ahead - q) ** 2).mean())

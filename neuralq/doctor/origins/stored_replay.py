@@ -22,6 +22,8 @@ _MOST_BYTES = 2**29
 def stored_replay(run: Path, agent: Agent, gamma: float) -> dict[str, Array] | None:
     """The columns ``obs, action, reward, terminated, truncated, next_obs``, one environment after the other.
 
+    Where actions are masked there are ``action_mask`` and ``next_action_mask``, too, which are stored in observations.
+
     Args:
         run: its folder.
         agent: says how observations were encoded.
@@ -30,7 +32,7 @@ def stored_replay(run: Path, agent: Agent, gamma: float) -> dict[str, Array] | N
     Returns:
         None where the run keeps no experience, too much of it, or keeps it normalised by statistics that moved on.
     """
-    if gamma == 0 or agent.normalisation is not None or agent.spec.masked:
+    if gamma == 0 or agent.normalisation is not None:
         return None
     try:
         state = checkpoint.load_newest(run / "checkpoints").state
@@ -43,7 +45,9 @@ def stored_replay(run: Path, agent: Agent, gamma: float) -> dict[str, Array] | N
     found = {name: np.concatenate([lane[name] for lane in lanes if lane]) for name in (lanes[0] or {})}
     if not found:
         return None
-    for name in ("obs", "next_obs"):
+    for name, mask in (("obs", "action_mask"), ("next_obs", "next_action_mask")):
+        if agent.spec.masked:
+            found[name], found[mask] = _apart(agent, found[name])
         found[name] = _decoded(agent, found[name])
     found["action"] = found["action"] + agent.first_action
     return found
@@ -70,6 +74,12 @@ def _lane(buffer: Mapping[str, Any], i: int) -> dict[str, Array]:
         "terminated": ended, "truncated": last & ~ended, "next_obs": held.s_t.numpy(),
     }  # fmt: skip
     return {name: column.copy() for name, column in columns.items()}
+
+
+def _apart(agent: Agent, rows: Array) -> tuple[Array, Array]:
+    """Observations as they are encoded, and which actions are legal, of rows that hold both."""
+    width = rows.shape[1] - agent.spec.num_actions
+    return rows[:, :width].reshape(len(rows), *agent.spec.inner_shape), rows[:, width:] != 0
 
 
 def _decoded(agent: Agent, encoded: Array) -> Array:
