@@ -105,20 +105,27 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 WHOLE = (
     *("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run"),
     *("test_checkers_learning", "test_elevators", "test_job_shop", "test_obelix", "test_thrun_robot_learning"),
+    *("test_bucket_brigade", "test_hierarchies"),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals", "test_sweep"),
     *("test_docs", "test_export_torch", "test_lab_registry", "test_registry", "test_scripts"),
     *("test_figures", "test_play_page", "test_report", "test_web_page"),
 )
 FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
+EXAMPLES = {ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("compositional.py", "zcs.py")}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
     for item in items:
+<<<<<<< HEAD
         is_whole = item.path.stem in WHOLE or not FOLDERS.isdisjoint(item.path.parents)
         if item.get_closest_marker("whole") is not None:
             item.add_marker("slow")
         elif is_whole and item.get_closest_marker("slow") is None:
+=======
+        is_whole = item.path.stem in WHOLE or item.path in EXAMPLES or not FOLDERS.isdisjoint(item.path.parents)
+        if is_whole and item.get_closest_marker("slow") is None:
+>>>>>>> main
             item.add_marker("slow")
             item.add_marker("whole")
     sizes = Counter(item.path for item in items)
