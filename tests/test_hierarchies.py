@@ -118,6 +118,9 @@ def test_an_option_runs_until_its_end() -> None:
         1 * 0.5 + 2 * 0.25 + 3 * 0.125, 4, 4, False, False
     )  # fmt: skip
     assert asked == [0, 1, 2, 3]
+    later = Line()
+    later.at = 2
+    assert run_option(later, 2, act, lambda s: s == 4)[:3] == (2 + 3, 2, 4)
     assert run_option(Line(), 0, act, lambda s: s == 0)[1:] == (9, 9, True, False)
     assert run_option(Line(True), 0, act, lambda s: False)[1:] == (7, 7, False, True)
     assert run_option(Line(), 0, act, lambda s: False, most_steps=3)[1:] == (3, 3, False, False)
