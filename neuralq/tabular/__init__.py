@@ -33,6 +33,7 @@ from neuralq.tabular.kernels.semi_markov import smdp_q_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
+from neuralq.tabular.nearest_sequences import NearestSequenceMemory
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
 from neuralq.tabular.policies import (
     EpsilonGreedy,
@@ -46,6 +47,7 @@ from neuralq.tabular.policies import (
 )
 from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
 from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
+from neuralq.tabular.suffix_tree import SuffixNode, UtileSuffixMemory
 from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
 from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 
@@ -62,13 +64,16 @@ __all__ = [
     "KToTheQ",
     "Learned",
     "Model",
+    "NearestSequenceMemory",
     "Power",
     "RandomPolicy",
     "RunOptions",
     "SearchThenConverge",
     "Softmax",
+    "SuffixNode",
     "Sweeps",
     "UpperConfidence",
+    "UtileSuffixMemory",
     "Visits",
     "alpha_beta",
     "apply",
