@@ -51,6 +51,10 @@ def shown(shows: Callable[[int, np.random.Generator], list[float]], **settings: 
     return case_of(lambda: Counting(shows=shows, **settings), both(np.abs))
 
 
+def trained(**settings: Any) -> Case:
+    return case_of(lambda: Counting(), both(np.abs), settings=Settings(**settings))
+
+
 def changed(change: Callable[[Any], None]) -> Case:
     net = two_layers(50)
     with torch.no_grad():
@@ -176,7 +180,9 @@ TWINS: dict[str, tuple[Made, Made]] = {  # ill, and well
     "D1": (lambda: with_fault("D1 at the limit"), stored_case),
     "D2": (lambda: with_fault("D2"), stored_case),
     "D3": (lambda: stored_case(**{name: column[:80] for name, column in experience().items()}), stored_case),
+    "D3a": (lambda: trained(capacity=100.0, batch_size=64.0), lambda: trained(capacity=1e4, batch_size=64.0)),
     "D4": (lambda: with_fault("D4"), stored_case),
+    "D4a": (lambda: trained(epsilon_start=0.0, epsilon_end=0.0), lambda: trained(epsilon_start=1.0, epsilon_end=0.0)),
     "D5": (lambda: with_fault("D5"), stored_case),
     "R1": (lambda: changed(silenced), lambda: changed(untouched)),
     "R2": (lambda: changed(one_unit_in_all), lambda: changed(untouched)),

@@ -230,8 +230,8 @@ def _repair(case: Case, one: Finding) -> _Repair | None:
         "V4": ("the target network copied every 500 updates", {"target_period_updates": 500}, None),
         "V5": (in_words(further), further, None),
         "V2": ("double Q-learning", {"target_rule": "double"}, None),
-        "D3": ("a buffer of 50,000 steps", {"capacity": 50_000}, None),
-        "D4": ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None),
+        **dict.fromkeys(("D3", "D3a"), ("a buffer of 50,000 steps", {"capacity": 50_000}, None)),
+        **dict.fromkeys(("D4", "D4a"), ("ε from 1 to 0.05", {"epsilon_start": 1.0, "epsilon_end": 0.05}, None)),
         "E4": ("observations normalised", {}, lambda: _normalised(case, make())),
         "E5": ("rewards of at most 1", {}, lambda: TransformReward(make(), lambda r: float(r) / case.largest_reward)),
     }

@@ -19,6 +19,8 @@ from neuralq.types import Array, Indices
 __all__ = [
     "actions_taken",
     "check_columns",
+    "few_batches",
+    "greedy_only",
     "legal_in_data",
     "merged_ends",
     "of_recorded",
@@ -170,8 +172,36 @@ def window(case: Case) -> Finding:
     )  # fmt: skip
 
 
+def few_batches(case: Case) -> Finding:
+    """D3a: how many batches the replay buffer holds, as the settings say."""
+    capacity, batch = case.settings.capacity, case.settings.batch_size
+    if capacity is None or not batch:
+        raise CannotMeasure("the size of the buffer or of a batch is not known (--set capacity=N --set batch_size=N)")
+    return Finding(
+        "D3a", "the buffer holds hardly more than a batch", "data", "B", capacity / batch, None, 10.0, "our own",
+        capacity < 10 * batch,
+        f"the buffer holds {capacity:,.0f} steps and a batch is {batch:,.0f}: updates see the latest steps alone, and "
+        "what was learned of others is lost",
+        "a larger buffer: 10,000 steps and more", f"neuralq train {case.world.name} --learner replay --capacity 50000",
+    )  # fmt: skip
+
+
+def greedy_only(case: Case) -> Finding:
+    """D4a: whether the settings let anything but the greedy action be tried."""
+    first, last = case.settings.epsilon_start, case.settings.epsilon_end
+    if first is None or last is None:
+        raise CannotMeasure("how it explored is not known (--set epsilon_start=E --set epsilon_end=E)")
+    return Finding(
+        "D4a", "nothing was explored", "data", "B", max(first, last), None, 0.0, "any", first == last == 0,
+        f"ε went from {first:g} to {last:g}"
+        + ("" if first or last else ": nothing but the greedy action was ever tried, and better ones stay unseen"),
+        "explore: ε from 1 down to 0.05, over a tenth of training or more",
+        "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
+    )  # fmt: skip
+
+
 def actions_taken(case: Case) -> Finding:
-    """D4: how much of every action there is; where no data are given, what exploration the settings allowed."""
+    """D4: how much of every action there is, in the data or else in greedy episodes."""
     num = case.world.num_actions
     grade: Grade
     if case.stored is not None:
@@ -179,10 +209,6 @@ def actions_taken(case: Case) -> Finding:
         legal = legal_in_data(case)
         counts = _chosen(np.clip(index, 0, num - 1), None if legal is None else legal[0], num)
         said, grade = "in the data", "B"
-    elif case.settings.epsilon_start == 0 and case.settings.epsilon_end == 0:
-        return _exploration(
-            "B", 1.0, "the settings say ε = 0 from first to last: nothing but the greedy action was ever tried"
-        )
     else:
         masks = [one.legal[:-1] for one in case.greedy if one.legal is not None]
         taken = np.concatenate([one.actions for one in case.greedy])
@@ -192,11 +218,12 @@ def actions_taken(case: Case) -> Finding:
     most = float(share.max())
     kept = share[share > 0]
     entropy = float(-(kept * np.log(kept)).sum() / np.log(num)) if num > 1 else 1.0
-    return _exploration(
-        grade,
-        most,
+    return Finding(
+        "D4", "hardly any action but one is tried", "data", grade, most, None, 0.95, "our own", most > 0.95,
         f"{said} action {int(share.argmax())} makes {100 * most:.3g} %, the entropy is {entropy:.2f} of its most",
-    )
+        "explore more: ε from 1 down to 0.05, over a tenth of training or more",
+        "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
+    )  # fmt: skip
 
 
 def _chosen(actions: Indices, legal: Array | None, num: int) -> Indices:
@@ -205,14 +232,6 @@ def _chosen(actions: Indices, legal: Array | None, num: int) -> Indices:
     if not len(chosen):
         raise CannotMeasure("nowhere was more than one action legal")
     return np.bincount(chosen, minlength=num)
-
-
-def _exploration(grade: Grade, most: float, said: str) -> Finding:
-    return Finding(
-        "D4", "hardly any action but one is tried", "data", grade, most, None, 0.95, "our own", most > 0.95, said,
-        "explore more: ε from 1 down to 0.05, over a tenth of training or more",
-        "DQN(..., exploration_initial_eps=1.0, exploration_final_eps=0.05)  # and train again",
-    )  # fmt: skip
 
 
 def rewards_seen(case: Case) -> Finding:

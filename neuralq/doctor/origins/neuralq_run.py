@@ -98,6 +98,7 @@ def settings_of_run(config: RunConfig, env_steps: float | None, reward_scale: fl
     traits = config.kind.traits(own)
     per_step = getattr(own, "updates_per_period", 1) / getattr(own, "train_period", 1)
     learned = None if env_steps is None else max(env_steps - getattr(own, "learning_starts", 0), 0)
+    epsilon = (None, None) if getattr(own, "noisy", False) else (config.epsilon_start, config.epsilon_end)
     capacity, batch, starts = (getattr(own, name, None) for name in ("capacity", "batch_size", "learning_starts"))
     return Settings(
         gamma=config.gamma,
@@ -109,8 +110,8 @@ def settings_of_run(config: RunConfig, env_steps: float | None, reward_scale: fl
         env_steps=env_steps,
         batch_size=None if batch is None else float(batch),
         capacity=None if capacity is None else float(capacity),
-        epsilon_start=config.epsilon_start,
-        epsilon_end=config.epsilon_end,
+        epsilon_start=epsilon[0],  # not known where noisy layers explore
+        epsilon_end=epsilon[1],
         epsilon_decay_steps=float(config.epsilon_decay_steps),
         learning_starts=None if starts is None else float(starts),
         reward_scale=reward_scale,
