@@ -57,7 +57,7 @@ def _text(totals: Mapping[str, np.ndarray], found: Mapping[str, tuple[Training, 
     return (
         f"{'Reproduced' if _is_reproduced(totals) else 'Not reproduced with these seeds'}: {at_best} of {num} "
         f"trainings of Sarsa(λ) end with a policy that takes {BEST} steps from the 46 starts together, and no policy "
-        "of percepts that always does the same takes fewer. Without traces none comes near.",
+        "of percepts that always does the same takes fewer. Without traces none comes to 420.",
         "The learner does not see the cell, but which of the cells around it are walls, and 46 cells look like 30. Who "
         "sees the cell needs 404 steps from everywhere. What acts on percepts alone, without a memory, has to do the "
         f"same in all cells that look alike; branch and bound proves that {BEST} is the least it can need "

@@ -46,7 +46,7 @@ def tree_svg(leaves: Mapping[tuple[int, ...], NDArray[np.float64]]) -> str:
 
     Example:
         >>> tree_svg({(0,): np.array([0.0, 1.0, 0.0, 0.0]), (1, 2): np.zeros(4)}).count("<path")
-        5
+        4
     """
     order = sorted(leaves)
     colours = percept_colours(mccallum_grid(), mccallum().observation)
