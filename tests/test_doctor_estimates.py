@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from neuralq.doctor import examination, tree
 from neuralq.doctor.estimates import area_under_curve, bounds_of, held_out_r2, held_out_scores, rank_correlation
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.tree import decide
@@ -66,8 +67,14 @@ def test_findings_are_weighed_at_the_edges() -> None:
     assert decide([flagged("V4", value=3.0), mistake, calm("R1")])[0][0].id == "V3"
     assert decide([flagged("E3", "environment"), flagged("V4", value=math.nan)])[0][0].id == "V4"
     assert decide([flagged("V1"), flagged("V6a"), flagged("V7")])[1].startswith("Cannot tell the cause")
-    for value, grade in ((9e3, "C"), (1.2e4, "B")):
-        found = {one.id: one.grade for one in decide([flagged("E5", "environment", value, "C"), flagged("V2")])[0]}
-        assert found["E5"] == grade
+    for name, value, grade in (("E5", 1e4, "C"), ("E5", 10000.5, "B"), ("E4", 100.0, "C"), ("E4", 100.5, "B")):
+        found = {one.id: one.grade for one in decide([flagged(name, "environment", value, "C"), flagged("V2")])[0]}
+        assert found[name] == grade
     assert decide([flagged("E6", "environment"), flagged("V2")])[1].endswith("conditional on that.")
     assert not decide([flagged("V5"), flagged("V2")])[1].endswith("conditional on that.")
+    assert not decide([flagged("E6", "environment")])[1].endswith("conditional on that.")  # there is nothing else
+    assert decide([calm("V1")])[1].startswith("Nothing was found") and decide([calm("R1")])[1].startswith("Cannot tell")
+
+
+def test_every_id_has_its_place_in_the_order_of_causes() -> None:
+    assert sorted(tree._ORDER) == sorted([*examination._MEASUREMENTS, "X1", "X2", "X3"])

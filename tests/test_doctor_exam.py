@@ -121,6 +121,9 @@ def test_bias_is_the_share_by_which_values_are_too_high(factor: float) -> None:
     found = values.bias(case)
     assert found.value == pytest.approx((factor - 1) * g.mean() / max(g.mean(), g.std()))
     assert found.flagged == (abs(factor - 1) > 0.1)
+    share = f"{100 * abs(found.value):.3g} % {'over' if factor >= 1 else 'under'}"
+    told = f"values average {factor * g.mean():.4g} where {g.mean():.4g} was returned, {share}"
+    assert factor == 1.0 or found.evidence == told
     assert factor == 1.0 or ("over" in found.title) == (factor > 1) == ("--target-rule double" in found.confirm)
     assert len(values.on_policy(case, case.greedy[:5])) == 5
     with pytest.raises(CannotMeasure, match="4 episodes"):
@@ -133,6 +136,8 @@ def test_bias_is_beside_the_spread_of_returns_where_their_mean_is_small() -> Non
     g = summed(np.arange(ENDS), lambda i: pays(i, 0))
     found = values.bias(ending(lambda t: 0.1 + summed(t, lambda i: pays(i, 0)), pays=pays))
     assert found.value == pytest.approx(0.1 / g.std()) and g.std() > 3 * abs(g.mean()) and found.flagged
+    nothing = values.bias(ending(lambda t: np.full(len(t), 0.1), pays=lambda t, a: 0.0))
+    assert nothing.value > 1e9 and nothing.flagged
 
 
 def test_returns_go_past_a_limit_that_can_be_lifted() -> None:
@@ -145,6 +150,7 @@ def test_without_lifting_only_steps_a_horizon_before_the_cut_count() -> None:
     case = case_of(lambda: Counting(ends=None, cuts=60), both(lambda t: np.full(len(t), 10.0)))
     found = values.bias(case)
     assert -0.01 < found.value < 0.06 and not found.flagged  # 0.9^29 < 0.05
+    assert [len(g) for _, g in values.on_policy(case)] == [60 - 29] * 20
     short = case_of(lambda: Counting(ends=None, cuts=20), both(lambda t: np.full(len(t), 10.0)))
     with pytest.raises(CannotMeasure, match="cannot be lifted"):
         values.bias(short)
@@ -193,8 +199,26 @@ def test_a_policy_is_held_against_the_best_that_needs_no_skill_and_its_luck() ->
     case = case_of(alternating, on_the_beat)
     chance = values.has_learned(case)  # which earns half of 20 on the average, and more with some luck
     mean = np.mean([one.score for one in case.chance])
+    drawn = values.has_learned(case_of(Drawing, lambda s: np.eye(2)[[1] * len(s)]))
+    assert drawn.source == "the upper bound of action 1 alone" and drawn.threshold is not None
+    assert drawn.flagged and drawn.interval is not None and drawn.interval[0] < drawn.value < drawn.interval[1]
+    assert 15.1 < drawn.threshold < 20  # 15 on the average, and what three of them may miss
     assert chance.source == "the upper bound of random" and chance.threshold is not None
     assert mean + 0.5 < chance.threshold < mean + 3 and chance.interval == (20, 20)
+
+
+def test_means_have_an_interval_where_there_are_two_that_differ() -> None:
+    rng = np.random.default_rng(0)
+    given = ([3.0], [2.0, 2.0, 2.0], [1.0, 3.0])
+    assert [values._mean_bounds(np.array(one), rng) for one in given] == [(3, 3), (2, 2), (1, 3)]
+
+
+class Drawing(Counting):
+    """Action 1 pays 1 or nothing, with equal chances."""
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        s, _, terminated, truncated, told = super().step(action)
+        return s, float(action * self.np_random.integers(2)), terminated, truncated, told
 
 
 GAINS = [  # of the other action over the greedy one, in three tries
@@ -219,6 +243,8 @@ def test_an_action_is_better_where_it_gains_more_than_two_standard_errors_and_mo
     )
     gains = 1e-12 * gains
     assert values.better_actions(case).value == 0  # of rounding
+    gains = 1e9 * gains  # a thousandth of what they were
+    assert values.better_actions(case).value == found.value
     for num, flagged in ((8, False), (14, True)):  # of 24: about 0.17 and 0.38 at least
         gains = np.zeros((24, 2, 3))
         gains[:num, 1] = 1.0
@@ -230,21 +256,31 @@ def test_an_action_is_better_where_it_gains_more_than_two_standard_errors_and_mo
 
 
 class Late(Counting):
-    """Pays for action 1 a step later."""
+    """Pays for action 1 two steps later; does not go on past its end."""
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        before, self.before = getattr(self, "before", 0), int(action)
+        assert self.t < 40
+        self.taken = [*(getattr(self, "taken", ()) if self.t else ()), int(action)]
         s, _, terminated, truncated, told = super().step(action)
-        return s, float(before), terminated, truncated, told
+        return s, float(self.taken[-3]) if self.t > 2 else 0.0, terminated, truncated, told
 
 
 def test_what_an_action_gains_is_discounted_and_cannot_be_told_of_what_cannot_be_copied(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    case = case_of(lambda: Late(ends=60), both(lambda t: np.zeros(len(t))))
+    case = case_of(lambda: Late(ends=40), lambda s: np.eye(2)[[1] * len(s)])
     states = values._snapshots(case)
-    assert values._gains(case, states)[:, 1] == pytest.approx(GAMMA) and {len(s) for _, s, _ in states} == {1}
-    assert len({float(s[0]) for _, s, _ in states}) > 5  # at all times of an episode's first half
+    assert values._gains(case, states)[:, 0] == pytest.approx(-(GAMMA**2)) and len(states) == 10
+    seen = {float(s[0]) for _, s, _ in states}  # at all times of an episode's first half
+    assert len(seen) > 5 and 13 < max(seen) < 20
+    taken = np.concatenate([env.unwrapped.taken for env, s, _ in states if s[0] > 0])
+    assert set(taken) == {0, 1} and taken.mean() > 0.85
+    brief = replace(case, world=open_world(lambda: Counting(ends=5)))
+    assert max(float(s[0]) for _, s, _ in values._snapshots(brief)) < 5  # begun anew
+    monkeypatch.setattr(values, "_LARGE", 1)
+    assert len(values._snapshots(case)) == 8
+    spent = replace(case, clock=Clock(1e-9))
+    assert (values._gains(spent, states) == 0).all()  # after the first step, before anything is paid
     monkeypatch.setattr(Counting, "__deepcopy__", lambda env, memo: 1 / 0, raising=False)
     with pytest.raises(CannotMeasure, match="cannot be copied"):
         values.better_actions(case)
@@ -268,6 +304,7 @@ def test_reach_is_the_share_that_so_many_copies_can_carry(copies: int, flagged: 
     known = Settings(updates=100.0 * copies, target_period_updates=100.0)
     case = case_of(lambda: TimeLimit(Counting(ends=None), 40), both(lambda t: t), settings=known)
     assert values.reach(case).value == pytest.approx(1 - GAMMA**copies)
+    assert f"see {100 * (1 - GAMMA**copies):.3g} % of what" in values.reach(case).evidence
     assert values.reach(case).flagged == flagged
     ended = case_of(lambda: Counting(ends=4), both(lambda t: t), settings=known)  # 4 steps are all there is to see
     assert values.reach(ended).value == pytest.approx(1.0) and not values.reach(ended).flagged
@@ -778,6 +815,7 @@ def test_stored_actions_are_those_that_the_environment_names() -> None:
             self.action_space = spaces.Discrete(2, start=3)
 
         def action(self, action: Any) -> int:
+            assert self.action_space.contains(int(action))
             return int(action) - 3
 
     rows = {**experience(), "reward": np.ones(600), "action": experience()["action"] + 3}
@@ -786,6 +824,8 @@ def test_stored_actions_are_those_that_the_environment_names() -> None:
     errors = 1 + GAMMA * (101 + s) - (s + 100 * a)
     got = values._td_error(case, None, *(case.stored[k] for k in ("obs", "action", "reward", "next_obs", "terminated")))  # type: ignore[index]
     assert got == pytest.approx((errors**2).mean())
+    assert 0.01 < values.generalisation(case).value < 1  # the same, of a policy that prefers action 1
+    assert values.better_actions(case).value == 0 and values.has_learned(case).value == 50
 
 
 def test_a_missing_column_is_named_with_the_line_that_writes_it() -> None:
@@ -803,13 +843,13 @@ def test_errors_on_fresh_experience_are_compared_with_those_on_the_data() -> Non
     assert values.generalisation(learned).flagged
 
 
-@pytest.mark.parametrize(("reward", "flagged"), [(0.5, True), (0.70, True), (0.72, False)])
+@pytest.mark.parametrize(("reward", "flagged"), [(0.5, True), (0.70, True), (0.72, False), (0.0, True)])
 def test_the_ratio_of_errors_is_that_of_squares_within_the_limit(reward: float, flagged: bool) -> None:
     """Values of 0: errors are rewards, 1 in the first 50 steps, which is all that was ever learned from, then 9."""
     make = lambda: TimeLimit(Counting(ends=None, pays=lambda t, a: 1.0 if t < 50 else 9.0), 50)  # noqa: E731
     data = {**experience(), "reward": np.full(600, reward)}
     found = values.generalisation(case_of(make, both(lambda t: np.zeros(len(t))), data=data))
-    assert found.value == pytest.approx(1 / reward**2) and found.flagged == flagged
+    assert found.value == pytest.approx(1 / max(reward**2, 1e-12)) and found.flagged == flagged
 
 
 # V7: exactly.

@@ -16,7 +16,7 @@ from neuralq.doctor.exam.case import CannotMeasure, Case, Measurement, begin
 from neuralq.doctor.experiments import run_experiments
 from neuralq.doctor.findings import Finding
 from neuralq.doctor.loading import load_subject
-from neuralq.doctor.play import Clock, EnvironmentRaised, returns_from
+from neuralq.doctor.play import Clock, EnvironmentRaised
 from neuralq.doctor.report import Report
 from neuralq.doctor.subject import Settings, Subject, with_settings
 from neuralq.doctor.tree import decide
@@ -262,7 +262,7 @@ def _drawn(case: Case) -> dict[str, Array]:
     """Points for the page: Q and G of greedy steps, and Q at the start beside the return."""
     rng, pairs, starts = case.rng(99), [], []
     for one in case.greedy:
-        returns = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        returns = case.returns(one)
         if len(returns):
             q = one.values[np.arange(len(returns)), one.actions[: len(returns)]]
             pairs.append(np.column_stack([returns, q]))

@@ -21,7 +21,7 @@ from neuralq.doctor.findings import UNEXPLAINED, Finding
 __all__ = ["decide"]
 
 _ORDER = tuple(
-    "X3 X2 X1 NaN E1 E3 E6 R6a D1 D2 D5 E4 E5 D3a D4a D3 D4 R7 R1 V5 V3 X5 V4 V7a V2 V6a V7 V1 "
+    "X3 X2 X1 E1 E3 E6 R6a D1 D2 D5 E4 E5 D3a D4a D3 D4 R7 R1 V5 V3 X5 V4 V7a V2 V6a V7 V1 "
     "R3 R6 E2 V6 V3a V8 R2 R4 R5".split()
 )
 _CERTAIN = {"E1", "E3", "E6", "D1", "D2", "D3a", "D4a", "D5", "V7", "V7a"}
@@ -91,7 +91,7 @@ def _place(one: Finding, by_id: Mapping[str, Finding]) -> int:
         return 0
     if one.id == "V4" and one.value > 3 and "R1" in by_id and not by_id["R1"].flagged:
         return _ORDER.index("V5")  # far beyond any return: divergence explains what else the values say
-    return _ORDER.index(one.id) if one.id in _ORDER else -1
+    return _ORDER.index(one.id)
 
 
 def _headline(flagged: Sequence[Finding], by_id: Mapping[str, Finding]) -> str:

@@ -18,7 +18,6 @@ from neuralq.doctor.estimates import bounds_of, held_out_scores
 from neuralq.doctor.exam.case import CannotMeasure, Case
 from neuralq.doctor.exam.signs import fresh, hidden
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import returns_from
 from neuralq.types import Array, Floats
 
 __all__ = ["capacity", "labelled", "regressed", "t_interval"]
@@ -96,7 +95,7 @@ def labelled(case: Case, most: int) -> tuple[Array, Array, Floats, Array]:
     """
     rows = []
     for i, one in enumerate((*case.greedy, *case.explored)):
-        g = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        g = case.returns(one)
         if len(g):
             rows.append((one.observations[: len(g)], one.actions[: len(g)], g, np.full(len(g), i)))
     if len(rows) < 9:

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Clock, Episode, horizon, play
+from neuralq.doctor.play import Clock, Episode, horizon, play, returns_from
 from neuralq.doctor.subject import Settings, Subject
 from neuralq.doctor.worlds import World
 from neuralq.types import Array, Floats, Indices
@@ -85,6 +85,10 @@ class Case:
     def largest_reward(self) -> float:
         """Max |r| seen."""
         return max((float(np.abs(one.rewards).max()) for one in self.episodes), default=0.0)
+
+    def returns(self, one: Episode) -> Floats:
+        """G of its steps whose return is known, ``[n]``: to 1 % where episodes go on past the limit, else to 5 %."""
+        return returns_from(one, self.gamma, 0.01 if self.world.liftable else 0.05)
 
     @property
     def horizon(self) -> int:

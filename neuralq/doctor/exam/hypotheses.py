@@ -90,7 +90,7 @@ def lines(case: Case, most: int = 2) -> dict[str, Floats]:
     made, errors, _ = _errors(case)
     found = {}
     for one in sorted(made, key=lambda one: float(errors[one.name].sum()))[:most]:
-        right = [returns_from(episode, case.gamma, 0.01 if case.world.liftable else 0.05) for episode in case.greedy]
+        right = [case.returns(episode) for episode in case.greedy]
         wrong = [one.returns(episode)[: len(g)] for episode, g in zip(case.greedy, right, strict=True)]
         points = np.column_stack([np.concatenate(right), np.concatenate(wrong)])
         parts = np.array_split(points[np.argsort(points[:, 0], kind="stable")], 20)
@@ -144,7 +144,7 @@ def _errors(case: Case) -> tuple[list[_Hypothesis], dict[str, Floats], Floats]:
     errors: dict[str, list[float]] = {_CORRECT: [], **{one.name: [] for one in made}}
     count = []
     for one in case.greedy:
-        right = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        right = case.returns(one)
         n = len(right)
         if not n:
             continue

@@ -13,10 +13,14 @@ from neuralq.doctor.exam.case import CannotMeasure, Case, greedy_of, legal_at, s
 from neuralq.doctor.exam.retraining import further_reach, in_words, retrained
 from neuralq.doctor.exam.stored import legal_in_data
 from neuralq.doctor.findings import Finding
-from neuralq.doctor.play import Episode, legal_in, returns_from
+from neuralq.doctor.play import Episode, legal_in
 from neuralq.types import Array, Floats
 
 __all__ = ["better_actions", "bias", "generalisation", "has_learned", "rank", "reach", "soft_divergence"]
+
+
+_BIAS, _EXCESS, _REACH, _RANK, _WORSE, _FRESH = 0.1, 1.1, 0.9, 0.3, 0.2, 2.0
+"""Thresholds of V2, V4, V5, V6, V6a and V8."""
 
 
 def has_learned(case: Case) -> Finding:
@@ -55,7 +59,7 @@ def on_policy(case: Case, episodes: Sequence[Episode] | None = None) -> list[tup
     """
     found = []
     for one in case.greedy if episodes is None else episodes:
-        returns = returns_from(one, case.gamma, 0.01 if case.world.liftable else 0.05)
+        returns = case.returns(one)
         if len(returns):
             n = len(returns)
             found.append((one.values[np.arange(n), one.actions[:n]], returns))
@@ -80,13 +84,13 @@ def bias(case: Case) -> Finding:
 
     value = float(share(sums.sum(0)[None])[0])
     low, high = bounds_of(sums, share, case.rng(12))
-    off = low > 0.1 or high < -0.1
+    off = low > _BIAS or high < -_BIAS
     mean_q, mean_g = (float(np.concatenate([p[k] for p in pairs]).mean()) for k in (0, 1))
     way = "over" if value > 0 else "under"
     said = f"values average {mean_q:.4g} where {mean_g:.4g} was returned, {100 * abs(value):.3g} % {way}"
     return Finding(
         "V2", "values are overestimated" if value > 0 else "values are underestimated", "algorithm", "B", value,
-        (low, high), 0.1, "our own; the quantity is that of REDQ (Chen et al. 2021)", off, said,
+        (low, high), _BIAS, "our own; the quantity is that of REDQ (Chen et al. 2021)", off, said,
         "double Q-learning, or a lower γ" if value > 0 else "see reach (V5) and the hypotheses (V3)",
         f"neuralq train {case.world.name} --learner replay --target-rule double"
         if value > 0 else f"neuralq train {case.world.name}  # λ-returns, which bootstrap less",
@@ -110,9 +114,9 @@ def soft_divergence(case: Case) -> Finding:
     ratio = most / bound
     said = f"the largest |Q| is {most:.4g}, and no return can exceed {bound:.4g}"
     return Finding(
-        "V4", "values exceed every possible return", "algorithm", "B", ratio, None, 1.1, "van Hasselt et al. 2018",
-        ratio > 1.1,
-        said, "a target network that is copied less often, a smaller step size, and the end of episodes in the target",
+        "V4", "values exceed every possible return", "algorithm", "B", ratio, None, _EXCESS, "van Hasselt et al. 2018",
+        ratio > _EXCESS, said,
+        "a target network that is copied less often, a smaller step size, and the end of episodes in the target",
         f"neuralq train {case.world.name}  # λ-returns with LayerNorm; and neuralq lab prescribe",
     )  # fmt: skip
 
@@ -150,8 +154,7 @@ def reach(case: Case) -> Finding:
     changes = further_reach(case)
     return Finding(
         "V5", "values cannot see far enough: the target network was copied too seldom", "algorithm", "B", value, None,
-        0.9,
-        "our own; ρ = 1 − γ^(nK) was measured as predicted", value < 0.9, said,
+        _REACH, "our own; ρ = 1 − γ^(nK) was measured as predicted", value < _REACH, said,
         f"{in_words(changes)}; or λ-returns", _confirming_reach(case, changes),
     )  # fmt: skip
 
@@ -180,7 +183,7 @@ def rank(case: Case) -> Finding:
         raise CannotMeasure("returns hardly differ between states, so that there is no order to get right")
     rho = rank_correlation(q, g)
     return Finding(
-        "V6", "values do not order states by their returns", "algorithm", "C", rho, None, 0.3, "our own", rho < 0.3,
+        "V6", "values do not order states by their returns", "algorithm", "C", rho, None, _RANK, "our own", rho < _RANK,
         f"the rank correlation of values and returns is {rho:.2f}", "see the other findings", "plot Q against G: "
         "the page does",
     )  # fmt: skip
@@ -202,8 +205,8 @@ def better_actions(case: Case) -> Finding:
     low, high = bounds_of(np.column_stack([worse, np.ones(len(worse))]), lambda s: s[:, 0] / s[:, 1], case.rng(17))
     share = float(worse.mean())
     return Finding(
-        "V6a", "another action is better in many states", "algorithm", "B", share, (low, high), 0.2, "our own",
-        low > 0.2,
+        "V6a", "another action is better in many states", "algorithm", "B", share, (low, high), _WORSE, "our own",
+        low > _WORSE,
         f"in {int(worse.sum())} of {len(worse)} states another action returned significantly more than the greedy one",
         "the values order actions wrongly: train longer, explore more, or mend what the other findings name",
         f"neuralq train {case.world.name}  # and compare returns",
@@ -293,7 +296,9 @@ def generalisation(case: Case) -> Finding:
     if stored is None:
         raise CannotMeasure("the data that was learned from was not given (--data file.npz)")
     masks = legal_in_data(case)
-    known = np.ones(len(stored["reward"]), bool) if masks is None else stored["terminated"] | masks[1].any(1)
+    known = (
+        np.ones(len(stored["reward"]), bool) if masks is None else stored["terminated"].astype(bool) | masks[1].any(1)
+    )
     if not known.any():
         raise CannotMeasure("of no stored step it is known which actions were legal after it")
     pick = case.rng(18).permutation(np.flatnonzero(known))[:2000]
@@ -306,7 +311,8 @@ def generalisation(case: Case) -> Finding:
     fresh = _td_error(case, legal, *(x[fresh_rows] for x in (s, a + case.world.first_action, r, s_t, ended)))
     ratio = fresh / max(learned, 1e-12)
     return Finding(
-        "V8", "errors are larger on fresh experience", "data", "C", ratio, None, 2.0, "Li et al. 2023", ratio > 2,
+        "V8", "errors are larger on fresh experience", "data", "C", ratio, None, _FRESH, "Li et al. 2023",
+        ratio > _FRESH,
         f"the mean squared TD error is {fresh:.3g} on fresh experience and {learned:.3g} on the stored data",
         "a smaller network, fewer updates per step, or more data", "halve the updates per step, and compare",
     )  # fmt: skip
