@@ -101,6 +101,9 @@ def test_the_page_is_one_file_and_says_what_was_found(sick: Report, tmp_path: Pa
     assert sick.headline in text and "What was not measured, and why" in text and "prefers-color-scheme: dark" in text
     assert "<script" not in text and "http://" not in text.replace("http://www.w3.org/2000/svg", "")
     assert text.count("<svg") == 2 and all(one.title in text for one in sick.findings if one.grade in "AB")
+    assert "mistakes that fit best" in text
+    well = dataclasses.replace(sick, findings=()).write(tmp_path / "well.html").read_text(encoding="utf-8")
+    assert "mistakes that fit best" not in well and "with γ = " not in well  # nobody is to be told apart
     fresh = (0.1, 0.2, 0.2, 0.3, 0.1, 0.2, 0.2, 0.3)
     signs = [Finding("R2", "", "algorithm", "C", x, threshold=3.0, fresh=fresh) for x in (0.2, 4.0)]
     signs += [Finding("R4", "", "algorithm", "C", 0.0, threshold=0.1, fresh=(0.0,) * 8)]

@@ -275,6 +275,10 @@ def test_what_an_action_gains_is_discounted_and_cannot_be_told_of_what_cannot_be
     assert len(seen) > 5 and 13 < max(seen) < 20
     taken = np.concatenate([env.unwrapped.taken for env, s, _ in states if s[0] > 0])
     assert set(taken) == {0, 1} and taken.mean() > 0.85
+    asked: list[int] = []
+    counted = replace(case, subject=load_subject(lambda s: [asked.append(len(s)), np.tile(s, 2)][1]))  # type: ignore[func-returns-value]
+    same = values._values(counted, [np.array([3.0]), np.array([5.0]), np.array([3.0])])
+    assert same.tolist() == [[3, 3], [5, 5], [3, 3]] and asked == [2]  # copies that see the same are asked once
     brief = replace(case, world=open_world(lambda: Counting(ends=5)))
     assert max(float(s[0]) for _, s, _ in values._snapshots(brief)) < 5  # begun anew
     monkeypatch.setattr(values, "_LARGE", 1)

@@ -185,9 +185,8 @@ def fit(case: Case, seeds: int = 3) -> Finding:
         "X2", "the network cannot represent the returns", "representation", "A", float(np.mean(gaps)), (low, high),
         _GAP,
         "own", bool(low > _GAP),
-        f"a fresh network of this architecture explains {100 * own:.0f} % of the variance of held-out returns, one "
-        f"of ours "
-        f"{100 * better:.0f} %",
+        f"a fresh network of this architecture predicts held-out returns with R² {own:.2f}, one of ours with "
+        f"{better:.2f}",
         "a wider body with LayerNorm, and observations scaled to about ±1",
         f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
     )  # fmt: skip

@@ -24,6 +24,11 @@ _STYLE = """
 pre { background: var(--card); padding: .5rem .8rem; font-size: .85rem; border-radius: .3rem;
   white-space: pre-wrap; overflow-wrap: anywhere; }
 h3 { font-size: 1rem; margin: 1.4rem 0 .2rem; }
+@media (max-width: 40rem) { /* rows of many cells: the words below the numbers */
+  tr:has(> :nth-child(4)) { display: flex; flex-wrap: wrap; border-bottom: 1px solid var(--line); }
+  tr:has(> :nth-child(4)) > * { flex: 1 1 5rem; min-width: 4.5rem; border: 0; }
+  tr > :nth-child(n + 4):last-child { flex-basis: 100%; padding-top: 0; }
+}
 @media (min-width: 70rem) { .pair { display: grid; grid-template-columns: 1fr 1fr; gap: 1.5rem; } }
 """
 _GRADES = {"A": "shown by a controlled experiment", "B": "named by a measurement", "C": "a vital sign, no verdict"}
@@ -109,13 +114,13 @@ def _figures(page: Page, report: Report) -> None:
     pairs, starts = report.drawn.get("pairs"), report.drawn.get("starts")
     if pairs is None or starts is None:
         return
-    lines = {name: line for name, line in report.drawn.items() if name.startswith("with ")}
+    mistakes = {} if report.healthy else {n: line for n, line in report.drawn.items() if n.startswith("with ")}
     page.heading("Values against returns")
     page.figure(
-        _scatter("pairs", pairs[:, 0], pairs[:, 1], "return that followed, discounted", "value Q(s, a)", lines),
+        _scatter("pairs", pairs[:, 0], pairs[:, 1], "return that followed, discounted", "value Q(s, a)", mistakes),
         "Each point is a step of a greedy episode: what was returned from there, and what the values said. On the "
-        "dotted line both agree; above it values are too high. The other lines are the values of learners with the two "
-        "mistakes that fit best.",
+        "dotted line both agree; above it values are too high."
+        + (" The other lines are the values of learners with the two mistakes that fit best." if mistakes else ""),
     )
     page.figure(
         _scatter(

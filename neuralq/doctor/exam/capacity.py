@@ -55,8 +55,8 @@ def capacity(case: Case) -> Finding:
     return Finding(
         "R7", "a network of this kind cannot represent the returns", "representation", "B", float(np.mean(gaps)),
         (low, high), _GAP, "our own", low > _GAP,
-        f"a fresh network of this architecture explains {100 * own:.0f} % of the variance of held-out returns, random "
-        f"features {100 * other:.0f} %",
+        f"a fresh network of this architecture predicts held-out returns with R² {own:.2f}, random features with "
+        f"{other:.2f}",
         "a wider body with LayerNorm, and observations scaled to about ±1",
         f"neuralq train {case.world.name} --body.hidden '[256, 256]' --body.layer-norm true",
     )  # fmt: skip
