@@ -117,15 +117,10 @@ EXAMPLES = {ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("compos
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
     for item in items:
-<<<<<<< HEAD
-        is_whole = item.path.stem in WHOLE or not FOLDERS.isdisjoint(item.path.parents)
+        is_whole = item.path.stem in WHOLE or item.path in EXAMPLES or not FOLDERS.isdisjoint(item.path.parents)
         if item.get_closest_marker("whole") is not None:
             item.add_marker("slow")
         elif is_whole and item.get_closest_marker("slow") is None:
-=======
-        is_whole = item.path.stem in WHOLE or item.path in EXAMPLES or not FOLDERS.isdisjoint(item.path.parents)
-        if is_whole and item.get_closest_marker("slow") is None:
->>>>>>> main
             item.add_marker("slow")
             item.add_marker("whole")
     sizes = Counter(item.path for item in items)
