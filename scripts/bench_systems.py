@@ -41,6 +41,20 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def classifiers(num_problems: int) -> None:
+    from neuralq.systems.bucket_brigade.lives import live
+
+    live(0, num_problems=num_problems)
+
+
+def compositional(num_trials: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.hierarchies.studies import modules_study
+
+    modules_study(np.random.SeedSequence(0), num_trials=num_trials, test_every=num_trials, num_practised=num_trials)
+
+
 def elevators(num_hours: int) -> None:
     import numpy as np
 
@@ -63,6 +77,19 @@ def obelix_behaviours(num_steps: int) -> None:
     from neuralq.systems.obelix.lives import spend
 
     spend(0, "behaviours", "table", num_steps=max(num_steps, 4))
+
+
+def littman_sarsa(num_steps: int) -> None:
+    from neuralq.systems.littman.trainings import train
+
+    train(0, num_steps=num_steps)
+
+
+def mccallum_tree(num_trials: int) -> None:
+    """Most of it is NumPy on small arrays, and compiled by nobody."""
+    from neuralq.systems.mccallum.trials import NUM_LAST, train
+
+    train(0, "USM", max(num_trials, NUM_LAST))
 
 
 def pole_q_lambda(num_trials: int) -> None:
@@ -98,11 +125,15 @@ def checkers_perft(num_positions: int) -> None:
 
 WORK = {
     "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
+    "bucket-brigade": Work("10,000 problems of ZCS in Woods1", classifiers, 10_000, 20),
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
     "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
     "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
     "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
+    "hierarchies": Work("4,000 trials of CQ-L, half of them composite", compositional, 2000, 50),
     "job-shop": Work("6,000 episodes of repair, 51 tasks", job_shop, 6000, 20, most_seconds=5.0),
+    "littman": Work("1,000,000 steps of Sarsa(λ) on percepts", littman_sarsa, 1_000_000, 2000),
+    "mccallum": Work("200 trials of USM in the M", mccallum_tree, 200, 200),
     "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }

@@ -4,8 +4,8 @@ Mutants that die here: a turn to the other side, a box pushed along the heading 
 through a wall or into another box, a robot that moves although it was refused, sonars from the right to the left, a
 range from the centre instead of the rim, NEAR and FAR exchanged, BUMP at twice the distance, STUCK that stays after a
 turn; a Hamming weight of another bit, a radius that excludes itself, a new state that starts at 0 beside a known one, a
-cluster that forgets Laplace's rule, joins in spite of a value that disagrees, or keeps who has left; a behaviour that
-learns another one's reward, precedence the other way round.
+cluster that forgets Laplace's rule, begins at 0, takes a lesson that disagrees, counts without its size or has a say
+about what it makes unlikely; a behaviour that learns another one's reward, precedence the other way round.
 """
 
 from __future__ import annotations
@@ -166,30 +166,30 @@ def test_clusters_are_what_they_say() -> None:
             total += math.log(share if s >> i & 1 else 1.0 - share)
         return total
 
-    def likeliest(s: int, agrees: Any) -> list[Any] | None:
-        fitting = [c for c in written if agrees(c) and likelihood(c, s) >= math.log(floor)]
-        return max(fitting, key=lambda c: likelihood(c, s)) if fitting else None
-
-    def count(cluster: list[Any], s: int, by: int) -> None:
-        cluster[1] += by
-        cluster[2] = [min(max(n + by * (s >> i & 1), 0), cluster[1]) for i, n in enumerate(cluster[2])]
+    def worth(s: int) -> float:
+        said = [(c[1] * math.exp(likelihood(c, s)), c[0]) for c in written if likelihood(c, s) >= math.log(floor)]
+        return sum(weight * value for weight, value in said) / sum(weight for weight, _ in said) if said else 0.0
 
     for _ in range(150):
         s, y = int(rng.integers(2**num_bits)), float(rng.normal(scale=2.0))
-        before, joined = likeliest(s, lambda c: True), likeliest(s, lambda c, y=y: abs(c[0] - y) < 1.0)
-        if joined is None and before is not None and before[1] == 1:
-            joined = before
-        elif joined is None:
-            joined = [before[0] if before else 0.0, 0, [0] * num_bits]
-            written.append(joined)
-        if before is not None and before is not joined and before[1] > 1:
-            count(before, s, -1)
+        fitting = [c for c in written if abs(c[0] - y) < 1.0 and likelihood(c, s) >= math.log(floor)]
+        if not fitting:
+            written.append([y, 0, [0] * num_bits])
+        joined = max(fitting, key=lambda c: likelihood(c, s)) if fitting else written[-1]
         joined[0] += 0.5 * (y - joined[0])
-        count(joined, s, 1)
+        joined[1:] = joined[1] + 1, [n + (s >> i & 1) for i, n in enumerate(joined[2])]
         bit_update(memory, s, 0, y, 0.5)
-        best = likeliest(s, lambda c: True)
-        assert bit_values(memory, s, values) == pytest.approx(best[0] if best else 0.0, abs=1e-12)
-    assert bits_remembered(memory) == len(written) > 3
+        probe = int(rng.integers(2**num_bits))
+        assert bit_values(memory, probe, values) == pytest.approx(worth(probe), abs=1e-12) == values[0]
+    assert bits_remembered(memory) == len(written) > 3 and min(map(worth, range(2**num_bits))) < 0
+
+
+def test_where_there_is_no_room_for_another_cluster_the_likeliest_is_joined() -> None:
+    memory = bit_clusters(2, 1, likelihood=0.2)
+    for y in range(memory.q.shape[0]):
+        bit_update(memory, 0, 0, 10.0 * y, 1.0)
+    bit_update(memory, 3, 0, -10.0, 0.5)
+    assert bits_remembered(memory) == memory.size[1:].sum() + 1 and memory.size[0, 0] == 2 and memory.q[0, 0] == -5.0
 
 
 @pytest.mark.parametrize(
@@ -231,12 +231,21 @@ def test_lives_of_one_seed_are_alike_and_filmed_to_their_end() -> None:
 
 @pytest.mark.slow
 def test_behaviours_push_more_than_one_learner_and_than_what_was_written_by_hand() -> None:
+    """With seeds of its own: of 20, as the command has them, a ratio of 1.5 is known to ±.4 only."""
+    seeds = range(5000, 5100)
+
+    def share(control: str, generaliser: str = "table") -> float:
+        return float(np.mean([spend(seed, control, generaliser, filmed_steps=0).share for seed in seeds]))
+
+    alone = {one: share("monolith", one) for one in GENERALISERS}
+    by_hand = share("by hand")
+    for one in GENERALISERS:
+        assert share("behaviours", one) >= 1.5 * max(alone[one], by_hand)
+    assert alone["clusters"] >= 1.3 * alone["table"]
+    assert share("random") <= 0.3 * alone["table"]  # the control that must fail
+
+
+@pytest.mark.slow
+def test_the_page_says_what_came_out() -> None:
     found = run_system(system_named("obelix"))
-    share = {one.what.partition(":")[0]: float(np.mean(one.values)) for one in found.measured}
     assert len(found.measured[0].values) == 20 and not found.wrong
-    for one in ("table", "Hamming"):
-        assert share[f"behaviours, {one}"] >= 1.5 * max(share[f"monolith, {one}"], share["by hand"])
-    # With clusters 60 other seeds give 1.3 of one learner and 1.2 of the table; 20 do not tell that from 1.5 and 1.3.
-    assert share["behaviours, clusters"] >= 1.2 * share["monolith, clusters"]
-    assert share["monolith, clusters"] >= 1.1 * share["monolith, table"]
-    assert share["random moves"] <= 0.3 * share["monolith, table"]  # the control that must fail

@@ -41,6 +41,7 @@ ENVIRONMENTS = {
     "neuralq/DynaMaze-v0": Registration("neuralq_envs.dyna"),
     "neuralq/ExerciseGrid-v0": Registration("neuralq_envs.mitchell", {"goal": 4, "goal_reward": 10.0}),
     "neuralq/Gridworld-v0": Registration("neuralq_envs.gridworld"),
+    "neuralq/Landmarks-v0": Registration("neuralq_envs.landmarks"),
     "neuralq/MaximizationBias-v0": Registration("neuralq_envs.maximization_bias"),
     "neuralq/MitchellGrid-v0": Registration("neuralq_envs.mitchell"),
     "neuralq/RandomWalk-v0": Registration("neuralq_envs.random_walk"),
@@ -48,6 +49,7 @@ ENVIRONMENTS = {
         "neuralq_envs.random_walk", {"num_states": 19, "left_reward": -1.0, "right_reward": 1.0}
     ),
     "neuralq/ShortcutMaze-v0": Registration("neuralq_envs.changing", {"change": "shortcut"}, has_vector=False),
+    "neuralq/SlideMaze-v0": Registration("neuralq_envs.slide_maze"),
     "neuralq/TicTacToe-v0": Registration("neuralq_envs.tictactoe"),
     "neuralq/WindyGridworld-v0": Registration("neuralq_envs.windy"),
 }
@@ -72,6 +74,7 @@ WITHOUT_MODEL = {
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
     "neuralq/ThrunRobot-v0": Registration("neuralq_envs.thrun_robot", has_vector=False, max_episode_steps=30),
+    "neuralq/Woods1-v0": Registration("neuralq_envs.woods", has_vector=False, max_episode_steps=500),
 }
 
 

@@ -32,14 +32,21 @@ class SystemEntry(NamedTuple):
 
 SYSTEMS = {
     "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic"),
+    "bucket-brigade": SystemEntry(
+        "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods"
+    ),
     "checkers": SystemEntry("neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote"),
     "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen"),
     "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop"),
+    "hierarchies": SystemEntry("neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills"),
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
     ),
+    "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike"),
+    "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory"),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
+    "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once"),
     "thrun-robot": SystemEntry("neuralq.systems.thrun_robot:THRUN_ROBOT", "a robot that explains its way to a target"),
 }
 

@@ -28,11 +28,23 @@ from neuralq.tabular.kernels.bits import (
     bit_values,
     bits_remembered,
 )
+from neuralq.tabular.kernels.compositional import (
+    CompositionalQ,
+    CompositionalRates,
+    compositional_action,
+    compositional_module,
+    compositional_update,
+    compositional_value,
+    new_compositional_q,
+)
 from neuralq.tabular.kernels.random_numbers import new_stream
 from neuralq.tabular.kernels.semi_markov import smdp_q_update
+from neuralq.tabular.kernels.zcs import Zcs, ZcsRates, new_zcs, zcs_action, zcs_strengths, zcs_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
+from neuralq.tabular.nearest_sequences import NearestSequenceMemory
+from neuralq.tabular.options import OptionOutcome, run_option
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
 from neuralq.tabular.policies import (
     EpsilonGreedy,
@@ -45,7 +57,9 @@ from neuralq.tabular.policies import (
     Visits,
 )
 from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
+from neuralq.tabular.regions import Region, RegionOperator, RegionPlan, region_dp
 from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
+from neuralq.tabular.suffix_tree import SuffixNode, UtileSuffixMemory
 from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
 from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 
@@ -56,20 +70,31 @@ __all__ = [
     "BackupRule",
     "Band",
     "BitMemory",
+    "CompositionalQ",
+    "CompositionalRates",
     "Curve",
     "EpsilonGreedy",
     "Experience",
     "KToTheQ",
     "Learned",
     "Model",
+    "NearestSequenceMemory",
+    "OptionOutcome",
     "Power",
     "RandomPolicy",
+    "Region",
+    "RegionOperator",
+    "RegionPlan",
     "RunOptions",
     "SearchThenConverge",
     "Softmax",
+    "SuffixNode",
     "Sweeps",
     "UpperConfidence",
+    "UtileSuffixMemory",
     "Visits",
+    "Zcs",
+    "ZcsRates",
     "alpha_beta",
     "apply",
     "apply_episodes",
@@ -86,13 +111,19 @@ __all__ = [
     "bit_values",
     "bits_remembered",
     "compile_model",
+    "compositional_action",
+    "compositional_module",
+    "compositional_update",
+    "compositional_value",
     "double_q",
     "dyna_q",
     "episodic_q_learning",
     "expected_sarsa",
     "n_step",
     "new_ase_ace",
+    "new_compositional_q",
     "new_stream",
+    "new_zcs",
     "over_seeds",
     "predict",
     "prioritized_sweeping",
@@ -100,11 +131,16 @@ __all__ = [
     "q_learning",
     "queue_dyna",
     "r_learning",
+    "region_dp",
     "robbins_monro_sums",
+    "run_option",
     "sarsa",
     "sarsa_lambda",
     "smdp_q_update",
     "sweep_errors",
     "td_lambda",
     "under_policy",
+    "zcs_action",
+    "zcs_strengths",
+    "zcs_update",
 ]

@@ -18,7 +18,7 @@ MONOLITH, BEHAVIOURS, HAND, RANDOM = range(4)
 """Who is in control."""
 FIND, PUSH, UNWEDGE = range(3)
 """Behaviours; the later takes precedence where both apply."""
-_MEMORY_STEPS = 3  # for which a behaviour goes on after what called for it is over
+_MEMORY_STEPS = 3  # moves after a push, or after being refused, for which a behaviour goes on
 
 
 class Rates(NamedTuple):

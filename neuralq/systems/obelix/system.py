@@ -55,7 +55,7 @@ def _page(found: Mapping[str, tuple[Life, ...]], full: bool) -> ChapterPage:
         facts={
             "what is seen": "18 bits: NEAR and FAR of eight sonars, BUMP, STUCK",
             "constants": "α = .5, γ = .9, ε = .1; Hamming radius 1 (weights NEAR 2, FAR 1, BUMP and STUCK 5); clusters "
-            "from a likelihood of 10⁻⁴, values within 1.5",
+            "from a likelihood of 10⁻⁴, lessons within 1.5, a say by size times likelihood",
             "steps of a life": f"{steps:,}, in another room every 100",
         },
     )
@@ -78,8 +78,8 @@ def _text(shares: Mapping[str, float], steps: int) -> tuple[str, ...]:
         "for boxes, one pushes what it touches, one gets free, and the later takes precedence. Q-learning is "
         "off-policy, so each also learns from moves that another one chose, as long as it applies.",
         "Of 262,144 states few are ever seen twice, so a lesson should reach further than the state that it was "
-        "learned in: to states that differ in bits of small weight, or to a cluster of states in which the action was "
-        "worth as much.",
+        "learned in: to states that differ in bits of small weight, or to clusters of states that look alike and in "
+        "which the action was worth as much.",
     )
 
 

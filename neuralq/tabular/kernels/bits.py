@@ -3,13 +3,14 @@
 * a **table**: what is learned in a state is learned of that state;
 * **weighted Hamming distance**: it is learned of every state seen so far that differs in bits of small weight only, and
   a state that is new starts with the values of the nearest one;
-* **clusters**: each action keeps groups of states, each with one value and with how often every bit was on. A state
-  belongs to the group that makes it likeliest, if that is likely enough; a lesson joins it only if the values agree as
-  well, and else another group, or one of its own.
+* **clusters**: each action keeps groups of states, each with one value and with how often every bit was on. A lesson
+  joins the group that makes its state likeliest among those whose value agrees with it, if that is likely enough, and
+  else begins one. A state is worth what the groups say that make it likely enough, each counted by its size times how
+  likely it makes the state: the mean of a mixture of Bernoulli distributions.
 
 With a radius of 0 the second is the first.
 
-Source: Mahadevan & Connell 1992, sections 4.2 and 4.3.
+Source: Mahadevan & Connell 1992, sections 4.2 and 4.3; that all likely groups have a say, by their size, is ours.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ __all__ = ["BitMemory", "bit_clusters", "bit_hamming", "bit_table", "bit_update"
 
 _TABLE, _HAMMING, _CLUSTERS = range(3)
 _MOST_BITS = 22
-_MOST_CLUSTERS = 1024  # of each action; where all are taken, the likeliest is joined
+_MOST_CLUSTERS = 1024  # of each action; where all are taken, the likeliest is joined whatever its value
 
 
 class BitMemory(NamedTuple):
@@ -45,8 +46,8 @@ class BitMemory(NamedTuple):
         size: lessons in each cluster, ``[rows, A]``.
         on: how many of them had each bit on, ``[rows, A, n]``.
         likely: log-probability of a bit that is off, and of one that is on, ``[rows, A, n, 2]``.
-        least_likely: log-likelihood from which a state belongs to a cluster.
-        tolerance: by how much values of a cluster differ at most.
+        least_likely: log-likelihood from which a cluster has a say about a state.
+        tolerance: by how much a lesson and the cluster that it joins differ at most.
     """
 
     kind: int
@@ -112,7 +113,7 @@ def bit_clusters(num_bits: int, num_actions: int, likelihood: float = 1e-4, tole
     Args:
         num_bits: n.
         num_actions: A.
-        likelihood: a state belongs to a cluster that gives it at least this probability, in (0, 1].
+        likelihood: a cluster has a say about a state to which it gives at least this probability, in (0, 1].
         tolerance: a lesson joins a cluster whose value is closer to it than this, above 0.
 
     Raises:
@@ -204,8 +205,10 @@ def bit_values(memory: BitMemory, s: int, values: NDArray[np.float64]) -> float:
     row = s if memory.kind == _TABLE else -1 if memory.kind == _CLUSTERS else _nearest(memory, s)
     largest = -np.inf
     for a in range(len(values)):
-        known = _likeliest(memory, s, a) if memory.kind == _CLUSTERS else row
-        values[a] = memory.q[known, a] if known >= 0 else 0.0
+        if memory.kind == _CLUSTERS:
+            values[a] = _expected(memory, s, a)
+        else:
+            values[a] = memory.q[row, a] if row >= 0 else 0.0
         largest = max(largest, values[a])
     return largest
 
@@ -222,13 +225,14 @@ def bit_update(memory: BitMemory, s: int, a: int, target: float, step_size: floa
         step_size: α in (0, 1].
 
     Example:
-        Two lessons agree within the tolerance of 1.5; the third does not, and leaves for a cluster of its own.
+        Two lessons agree within the tolerance of 1.5; the third begins a cluster. The first expects each bit with 3/4,
+        the second with 2/3: the state is worth (2 · 9/16 · 1.25 + 1 · 4/9 · 9) / (2 · 9/16 + 4/9).
 
-        >>> memory = bit_clusters(2, 1)
+        >>> memory, values = bit_clusters(2, 1), np.zeros(1)
         >>> for target in (1.0, 1.5, 9.0):
         ...     bit_update(memory, 3, 0, target, 0.5)
-        >>> memory.used.tolist(), memory.q[:2, 0].tolist(), memory.size[:2, 0].tolist()
-        ([2], [1.0, 5.0], [1, 1])
+        >>> memory.q[:2, 0].tolist(), memory.size[:2, 0].tolist(), round(bit_values(memory, 3, values), 4)
+        ([1.25, 9.0], [2, 1], 3.4447)
     """
     if memory.kind == _TABLE:
         memory.q[s, a] += step_size * (target - memory.q[s, a])
@@ -262,51 +266,53 @@ def _nearest(memory: BitMemory, s: int) -> Any:
 
 
 @lean_kernel
-def _likeliest(memory: BitMemory, s: int, a: int) -> int:
-    """The cluster of ``a`` that makes ``s`` likeliest, or -1 for none that makes it likely enough."""
-    return _likeliest_about(memory, s, a, 0.0, np.inf)
+def _expected(memory: BitMemory, s: int, a: int) -> float:
+    """The mean value of ``a`` over the clusters that make ``s`` likely enough, 0 for none."""
+    worth, weights = 0.0, 0.0
+    for c in range(memory.used[a]):
+        likely = _log_likelihood(memory, c, a, s, memory.least_likely)
+        if likely >= memory.least_likely:
+            weight = memory.size[c, a] * math.exp(likely)
+            weights += weight
+            worth += weight / weights * (memory.q[c, a] - worth)
+    return worth
 
 
 @lean_kernel
-def _likeliest_about(memory: BitMemory, s: int, a: int, target: float, tolerance: float) -> int:
-    """As `_likeliest`, among the clusters whose value differs from ``target`` by less than ``tolerance``."""
-    best, most = -1, memory.least_likely
+def _likeliest(memory: BitMemory, s: int, a: int, least: float, target: float, tolerance: float) -> int:
+    """The cluster that makes ``s`` likeliest of those whose value is near ``target``, or -1 for none."""
+    best, most = -1, least
     for c in range(memory.used[a]):
-        if not abs(memory.q[c, a] - target) < tolerance:
-            continue
-        likely = 0.0
-        for i in range(memory.num_bits):
-            likely += memory.likely[c, a, i, s >> i & 1]
-            if likely < most:
-                break
-        if likely > most or (best < 0 and likely >= most):
-            best, most = c, likely
+        if abs(memory.q[c, a] - target) < tolerance:
+            likely = _log_likelihood(memory, c, a, s, most)
+            if likely > most or (best < 0 and likely >= most):
+                best, most = c, likely
     return best
 
 
 @lean_kernel
-def _join(memory: BitMemory, s: int, a: int, target: float, step_size: float) -> None:
-    """The lesson joins the likeliest cluster that it agrees with, or begins another; its state leaves the old one."""
-    before = _likeliest(memory, s, a)
-    c = _likeliest_about(memory, s, a, target, memory.tolerance)
-    if c < 0 and before >= 0 and (memory.size[before, a] == 1 or memory.used[a] == memory.size.shape[0]):
-        c = before  # nobody else is in it, or there is no room for another
-    elif c < 0:
-        c = min(memory.used[a], memory.size.shape[0] - 1)
-        memory.q[c, a] = memory.q[before, a] if before >= 0 else 0.0
-        memory.used[a] = c + 1
-    if before >= 0 and before != c and memory.size[before, a] > 1:
-        _count(memory, before, a, s, -1)
-    memory.q[c, a] += step_size * (target - memory.q[c, a])
-    _count(memory, c, a, s, 1)
+def _log_likelihood(memory: BitMemory, c: int, a: int, s: int, least: float) -> float:
+    """Of ``s`` in a cluster, or something below ``least`` where it is below."""
+    likely = 0.0
+    for i in range(memory.num_bits):
+        likely += memory.likely[c, a, i, s >> i & 1]
+        if likely < least:
+            break
+    return likely
 
 
 @lean_kernel
-def _count(memory: BitMemory, c: int, a: int, s: int, lessons: int) -> None:
-    """One lesson more or less in a cluster, and how likely it makes each bit."""
-    memory.size[c, a] += lessons
+def _join(memory: BitMemory, s: int, a: int, target: float, step_size: float) -> None:
+    """The lesson joins the likeliest cluster that it agrees with, or begins one."""
+    c = _likeliest(memory, s, a, memory.least_likely, target, memory.tolerance)
+    if c < 0 and memory.used[a] < memory.size.shape[0]:
+        c = memory.used[a]
+        memory.used[a], memory.q[c, a] = c + 1, target
+    elif c < 0:
+        c = _likeliest(memory, s, a, -np.inf, 0.0, np.inf)
+    memory.q[c, a] += step_size * (target - memory.q[c, a])
+    memory.size[c, a] += 1
     for i in range(memory.num_bits):
-        on = memory.on[c, a, i] + lessons * (s >> i & 1)
-        memory.on[c, a, i] = min(max(on, 0), memory.size[c, a])  # who leaves need not be who came
+        memory.on[c, a, i] += s >> i & 1
         share = (memory.on[c, a, i] + 1.0) / (memory.size[c, a] + 2.0)  # Laplace's rule
         memory.likely[c, a, i, 0], memory.likely[c, a, i, 1] = math.log(1.0 - share), math.log(share)
