@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
-import torch
 from hypothesis import settings
 
 gc.disable()  # until everything is collected: half of that time went into looking for garbage among what stays
@@ -27,9 +27,6 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
     [str(ROOT), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 
-# Several test processes share few cores, and single-threaded sums are the same bits on every machine.
-torch.set_num_threads(1)
-
 # The same examples in every run: a failure is the change's fault, never the day's. No deadline: kernels compile once.
 settings.register_profile("house", derandomize=True, max_examples=25, deadline=None, database=None)
 settings.load_profile("house")
@@ -41,7 +38,6 @@ settings.load_profile("house")
 
 def pytest_collection_finish() -> None:
     """From here on garbage is looked for, but not among what was collected."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 
@@ -65,6 +61,35 @@ def unpainted(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+WELL_KNOWN = ("CartPole-v1", "FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "neuralq/")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def probed_once() -> Iterator[None]:
+    """A run begins by trying whether its environment can be put back: here once for all that are made alike.
+
+    That was half of what a short run cost.
+    """
+    from neuralq.runs.folder.env_probe import is_resumable
+    from neuralq.runs.recipe import build, environments
+
+    found: dict[tuple[Any, ...], Any] = {}
+    probe = build._probe
+
+    def remembered(config: Any, envs: Any, make: Any) -> Any:
+        plain = not config.wrappers and config.frame_stack == 1 and environments.stand_in() is None
+        if not (plain and config.env.startswith(WELL_KNOWN) and build.is_resumable is is_resumable):
+            return probe(config, envs, make)
+        key = (config.env, repr(config.env_kwargs), config.resume_probe, type(envs), getattr(envs, "num_envs", 1))
+        if key not in found:
+            found[key] = probe(config, envs, make)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "_probe", remembered)
+        yield
+
+
 # Two processes that begin with these share no kernel; whoever comes to the networks' later finds them compiled.
 FIRST = ("test_engine", "test_contract_lab_methods")
 
@@ -76,11 +101,11 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 
 
 # What is tried whole takes long: systems whose loops have to be compiled, processes that are started, ended and killed,
-# pages in a browser, pictures. These are run by `make whole`, which CI does too.
+# pages in a browser, pictures. `make whole` runs these, and single tests that are marked `whole`; CI does so too.
 WHOLE = (
     *("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run"),
     *("test_checkers_learning", "test_elevators", "test_job_shop", "test_obelix", "test_thrun_robot_learning"),
-    *("test_bucket_brigade", "test_hierarchies"),
+    *("test_bucket_brigade", "test_hierarchies", "test_mccallum"),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals", "test_sweep"),
     *("test_docs", "test_export_torch", "test_lab_registry", "test_registry", "test_scripts"),
     *("test_figures", "test_play_page", "test_report", "test_web_page"),
@@ -93,11 +118,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes and the order of files; tests marked ``gpu`` are skipped where torch finds no accelerator."""
     for item in items:
         is_whole = item.path.stem in WHOLE or item.path in EXAMPLES or not FOLDERS.isdisjoint(item.path.parents)
-        if is_whole and item.get_closest_marker("slow") is None:
+        if item.get_closest_marker("whole") is not None:
+            item.add_marker("slow")
+        elif is_whole and item.get_closest_marker("slow") is None:
             item.add_marker("slow")
             item.add_marker("whole")
     sizes = Counter(item.path for item in items)
     items.sort(key=lambda item: place(item, sizes))  # stable: the order within a file stays
+    import torch  # not above: with xdist, the process that hands out the tests needs none
+
+    torch.set_num_threads(1)  # processes share few cores, and single-threaded sums are the same bits on every machine
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu") is not None:

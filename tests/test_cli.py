@@ -434,6 +434,7 @@ def test_commands_run_without_docstrings_and_assertions(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.whole
 def test_where_there_are_no_file_locks_it_is_said_in_one_line() -> None:
     """As on Windows."""
     code = (

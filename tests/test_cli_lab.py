@@ -218,6 +218,7 @@ def test_a_missing_extra_is_one_line_with_the_command(capsys: Capture, monkeypat
     assert "pip install 'neuralq[web]'" in refusal(capsys, "--serve")
 
 
+@pytest.mark.whole
 def test_help_and_diagnosis_import_no_torch() -> None:
     code = (
         "import sys; from neuralq.apps.cli import main\n"

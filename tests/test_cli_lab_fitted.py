@@ -211,6 +211,7 @@ def test_the_lab_exports_it_all() -> None:
         assert name in neuralq.lab.__all__ and callable(getattr(neuralq.lab, name))
 
 
+@pytest.mark.whole
 def test_without_a_network_torch_is_not_loaded() -> None:
     code = (
         "import sys; from neuralq.apps.cli import main\n"

@@ -111,6 +111,7 @@ def in_a_shell(command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.whole
 def test_a_terminal_that_knows_ascii_only_is_told_in_ascii() -> None:
     told = done(["--help"], PYTHONIOENCODING="ascii")
     assert told.returncode == 0 and "lambda" in told.stdout and "?" not in told.stdout and told.stdout.isascii()

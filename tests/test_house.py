@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -65,9 +66,15 @@ def dotted(node: ast.AST) -> str:
     return ""
 
 
+@lru_cache(maxsize=1)
+def nodes(tree: ast.Module) -> list[ast.AST]:
+    """All of them, walked once for all rules."""
+    return list(ast.walk(tree))
+
+
 def calls(tree: ast.Module) -> Iterator[tuple[ast.Call, str]]:
     """Every call with the dotted name of what is called."""
-    return ((node, dotted(node.func)) for node in ast.walk(tree) if isinstance(node, ast.Call))
+    return ((node, dotted(node.func)) for node in nodes(tree) if isinstance(node, ast.Call))
 
 
 def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -82,7 +89,7 @@ def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def long_functions(tree: ast.Module) -> Iterator[Offence]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             decorators = {dotted(d.func if isinstance(d, ast.Call) else d).split(".")[-1] for d in node.decorator_list}
             if not decorators & KERNEL_DECORATORS and code_lines(node) > MAX_FUNCTION_LINES:
@@ -90,7 +97,7 @@ def long_functions(tree: ast.Module) -> Iterator[Offence]:
 
 
 def merged_end_facts(tree: ast.Module) -> Iterator[Offence]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         names = [getattr(node, field, None) for field in ("id", "arg", "attr", "name")]
         if any(
             isinstance(name, str) and "done" in name and re.fullmatch(r"_*dones?_*|dones?_.*|.*_dones?", name)
@@ -100,7 +107,7 @@ def merged_end_facts(tree: ast.Module) -> Iterator[Offence]:
 
 
 def vague_classes(tree: ast.Module) -> Iterator[Offence]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.ClassDef):
             words = {word.lower() for word in re.findall(r"[A-Z]?[a-z0-9]+", node.name)}
             if words & {"manager", "utils"} or node.name.lower() in VAGUE_NAMES:
@@ -116,7 +123,7 @@ def squeezes_without_axis(tree: ast.Module) -> Iterator[Offence]:
 
 
 def pickles(tree: ast.Module) -> Iterator[Offence]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
             if {module.split(".")[0] for module in modules} & {"pickle", "cloudpickle", "dill", "shelve", "marshal"}:
@@ -261,6 +268,7 @@ def test_importing_neuralq_imports_neither_torch_nor_numpy() -> None:
     assert run.stdout.strip() == "[]"
 
 
+@pytest.mark.whole
 def test_public_names_load_on_demand_and_survive_the_import_of_every_module() -> None:
     program = (
         "import sys; sys.path[:0] = ['envs', '.']; import importlib, pkgutil, neuralq\n"
@@ -288,6 +296,7 @@ def in_a_fresh_process(program: str) -> str:
     return run.stdout
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "program",
     [
@@ -295,17 +304,14 @@ def in_a_fresh_process(program: str) -> str:
         "import neuralq_envs, gymnasium; neuralq_envs.register(); gymnasium.make('neuralq/MitchellGrid-v0').reset()",
         "import gymnasium, neuralq_envs; gymnasium.make_vec('neuralq/MitchellGrid-v0', num_envs=2).reset(seed=0)",
         # Two forks of one process, which has loaded what is large and nothing of ours.
-        pytest.param(
-            "import os, torch, gymnasium; first = os.fork()\n"
-            "assert not {name for name in sys.modules if name.startswith('neuralq')}\n"
-            "if first:\n"
-            "  import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0\n"
-            "  assert os.waitpid(first, 0)[1] == 0\n"
-            "else:\n"
-            "  from neuralq.runs.recipe.environments import make_envs; import neuralq\n"
-            "  make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()\n",
-            marks=pytest.mark.slow,
-        ),
+        "import os, torch, gymnasium; first = os.fork()\n"
+        "assert not {name for name in sys.modules if name.startswith('neuralq')}\n"
+        "if first:\n"
+        "  import neuralq.apps.cli as cli; assert cli.main(['solve', 'neuralq/MitchellGrid-v0', '--json']) == 0\n"
+        "  assert os.waitpid(first, 0)[1] == 0\n"
+        "else:\n"
+        "  from neuralq.runs.recipe.environments import make_envs; import neuralq\n"
+        "  make_envs(neuralq.RunConfig(env='neuralq/MitchellGrid-v0'), 2).close()\n",
     ],
 )
 def test_environments_are_found_by_an_import_and_by_what_neuralq_does(program: str) -> None:

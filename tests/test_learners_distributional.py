@@ -222,10 +222,8 @@ def test_the_discount_of_the_step_before_is_noticed(kind: str) -> None:
 @pytest.mark.parametrize("kind", SETTINGS)
 def test_the_distribution_of_a_coin_is_learned_and_not_its_mean_alone(kind: str) -> None:
     # One state, one action, 0 or 1 with equal chances: half of the quantiles at 0 and half at 1.
-    rng, rows = np.random.default_rng(0), 512
-    coins = torch.from_numpy(rng.integers(2, size=rows).astype(np.float64))
-    zero = torch.zeros(rows, dtype=torch.int64)
-    t = Transition(zero, zero, torch.ones(rows), coins, 0 * coins, zero, coins < 9)
+    coins, zero = torch.tensor([0.0, 1.0], dtype=torch.float64), torch.zeros(2, dtype=torch.int64)
+    t = Transition(zero, zero, torch.ones(2), coins, 0 * coins, zero, coins < 9)
     given: dict[str, Any] = {"distribution": kind, "num_atoms": 4, "optimiser": "sgd", "learning_rate": 1.0}
     inner = TableQ(1, 4)
     if kind == "categorical":

@@ -117,6 +117,7 @@ def test_a_second_writer_is_refused_with_folder_and_process_while_readers_are_no
     run.close()
 
 
+@pytest.mark.whole
 def test_the_lock_holds_between_processes_and_ends_with_a_kill(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom neuralq.runs.folder.run_folder import RunFolder\n"

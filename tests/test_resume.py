@@ -264,7 +264,7 @@ def kill_and_resume(start: Any, status: Any, path: Path, num_kills: int, rng: np
     return half_written
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [pytest.param(3, marks=pytest.mark.whole), pytest.param(10, marks=pytest.mark.slow)])
 def test_a_run_killed_again_and_again_ends_with_the_same_bits(
     kills: int, processes: Processes, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -290,6 +290,7 @@ def test_twelve_processes_of_their_own_killed_in_turn_end_with_the_same_bits(und
     assert clockless(path) == clockless(undisturbed)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_a_signal_saves_then_ends_and_a_second_writer_is_refused(
     name: str, status: int, processes: Processes, undisturbed: Path, tmp_path: Path

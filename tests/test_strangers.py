@@ -139,6 +139,7 @@ def test_the_shell_answers_too(case: str, capsys: pytest.CaptureFixture[str]) ->
     assert main(again) == 0
 
 
+@pytest.mark.whole
 def test_scripts_of_algorithms_are_options() -> None:
     found = subprocess.run([sys.executable, "-m", "neuralq.dqn"], capture_output=True, text=True, check=False)
     assert found.returncode == 1

@@ -142,7 +142,8 @@ class MlpEngine:
         q = np.empty(len(x), self._kind)
         wanted = q if target is None else target, self._ones[: len(x)] if weight is None else weight
         work = *self._work, self._deltas, self._spare
-        arguments: Any = (self._values, self._grad, *self._network, x, actions, *wanted, *loss, *work, q)
+        samples = (np.ascontiguousarray(column) for column in (actions, *wanted))  # views would be compiled for anew
+        arguments: Any = (self._values, self._grad, *self._network, x, *samples, *loss, *work, q)
         wrong = kernels.loss_gradient(*arguments)
         if wrong >= 0:
             raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions[wrong]}")
