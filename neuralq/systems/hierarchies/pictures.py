@@ -30,7 +30,8 @@ def modules_picture(study: Study) -> Picture:
         for module, landmark in enumerate(LANDMARKS):
             axes, goal = grid[landmark], int(ROOM.goals[module])
             shown[module, goal] = np.nan  # nobody leaves it
-            image = axes.pcolormesh(shown[module].reshape(8, 8), cmap="viridis", vmin=0.2, vmax=0.95)
+            behind = shown[module] - np.nanmax(shown[module])  # modules differ by constants, which are in K
+            image = axes.pcolormesh(behind.reshape(8, 8), cmap="viridis", vmin=-0.6, vmax=0.0)
             axes.text(goal % 8 + 0.5, goal // 8 + 0.5, landmark, ha="center", va="center", fontsize=9)
             axes.set(title=f"module {module + 1}", aspect="equal", xticks=[], yticks=[])
             axes.invert_yaxis()
@@ -54,8 +55,9 @@ def modules_picture(study: Study) -> Picture:
     )
     svg = draw_svg("modules", "Modules and gates of CQ-L", said, (5.4, 5.2), paint)
     caption = (
-        "CQ-L, first seed. Above: the largest action value of each module by cell; the landmark it learned to reach, "
-        "and the wall, are blank. Below: which module the gate gives to each stage of the composite tasks."
+        "CQ-L, first seed. Above: the largest action value of each module by cell, less what it is beside the landmark "
+        "that it learned to reach; that and the wall are blank. Below: which module the gate gives to each stage "
+        "of the composite tasks."
     )
     return Picture("Modules and gates", svg, caption)
 
