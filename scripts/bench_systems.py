@@ -79,6 +79,19 @@ def obelix_behaviours(num_steps: int) -> None:
     spend(0, "behaviours", "table", num_steps=max(num_steps, 4))
 
 
+def littman_sarsa(num_steps: int) -> None:
+    from neuralq.systems.littman.trainings import train
+
+    train(0, num_steps=num_steps)
+
+
+def mccallum_tree(num_trials: int) -> None:
+    """Most of it is NumPy on small arrays, and compiled by nobody."""
+    from neuralq.systems.mccallum.trials import NUM_LAST, train
+
+    train(0, "USM", max(num_trials, NUM_LAST))
+
+
 def pole_q_lambda(num_trials: int) -> None:
     from neuralq.systems.peng_williams.trials import Settings, train
 
@@ -119,6 +132,8 @@ WORK = {
     "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "hierarchies": Work("4,000 trials of CQ-L, half of them composite", compositional, 2000, 50),
     "job-shop": Work("6,000 episodes of repair, 51 tasks", job_shop, 6000, 20, most_seconds=5.0),
+    "littman": Work("1,000,000 steps of Sarsa(λ) on percepts", littman_sarsa, 1_000_000, 2000),
+    "mccallum": Work("200 trials of USM in the M", mccallum_tree, 200, 200),
     "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),
     "peng-williams": Work("150 trials of Q(λ), λ = .5", pole_q_lambda, 150, 50),
 }

@@ -105,7 +105,7 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 WHOLE = (
     *("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run"),
     *("test_checkers_learning", "test_elevators", "test_job_shop", "test_obelix", "test_thrun_robot_learning"),
-    *("test_bucket_brigade", "test_hierarchies"),
+    *("test_bucket_brigade", "test_hierarchies", "test_mccallum"),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals", "test_sweep"),
     *("test_docs", "test_export_torch", "test_lab_registry", "test_registry", "test_scripts"),
     *("test_figures", "test_play_page", "test_report", "test_web_page"),

@@ -82,7 +82,8 @@ def test_branch_and_bound_finds_the_best_of_all_policies_without_memory(seed: in
             v = evaluate_memoryless(aliased, found.policy, gamma)
             assert v @ aliased.mdp.start_distribution == pytest.approx(best, abs=1e-9)
         cut = best_memoryless(aliased, gamma, max_bounds=1)
-        assert cut.bound >= best - 1e-9 and cut.value <= best + 1e-9 and (cut.proved or cut.bound > cut.value)
+        assert cut.bound >= best - 1e-9 and cut.value <= best + 1e-9
+        assert cut.proved == (cut.bound <= cut.value + 1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -180,6 +181,12 @@ def test_without_memory_a_coin_may_be_best_and_with_it_one_step_tells() -> None:
         assert evaluate_memoryless(SWAP, policy, 0.9).mean() == pytest.approx(value)
     assert best_memoryless(SWAP, 0.9).value == pytest.approx(-9.0)
     assert solve_histories(SWAP, 0.9).value == pytest.approx(9.0)
+
+
+def test_who_has_ended_is_not_among_those_that_may_still_be() -> None:
+    """1 → 0 → the end, which looks like both: 1/2 · 1 + 1/2 · γ."""
+    way = FiniteMDP.from_arrays([[[0, 0, 1], [1, 0, 0], [0, 0, 0]]], [[1.0], [0.0], [np.nan]])
+    assert solve_histories(AliasedMDP(way, np.zeros(3, dtype=int)), 0.5).value == pytest.approx(0.75)
 
 
 def test_percepts_are_walls_around_a_cell() -> None:

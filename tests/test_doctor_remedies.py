@@ -111,7 +111,7 @@ def test_defaults_of_stable_baselines_are_named_reach_and_the_line_that_is_print
     env, path = gym.make("CartPole-v1"), tmp_path / "agent.zip"
     as_it_comes = stable_baselines3.DQN("MlpPolicy", env, seed=0).learn(50_000)
     as_it_comes.save(path)
-    report = examine(path, "CartPole-v1")
+    report = examine(path, "CartPole-v1", budget_s=50)
     first = report.findings[0]
     assert (first.id, first.grade, report.cause) == ("V5", "B", "algorithm") and report.seconds < 60
     assert first.confirm.splitlines() == confirms

@@ -34,12 +34,12 @@ def two_states(x: tuple[float, float], gamma: float = 0.9, epsilon: float = 0.0)
     return Problem.from_mdp(mdp, [[x[0]], [x[1]]], gamma=gamma, state_distribution=[0.5, 0.5])
 
 
-@pytest.mark.parametrize("num_upper", [5, 6, 7, 8, 9])
+@pytest.mark.parametrize("num_upper", [5, 7, 9, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 8))])
 def test_gamma_of_the_star_has_a_closed_form(num_upper: int) -> None:
     assert critical(star(num_upper), "gamma") == pytest.approx((num_upper + 9) / (2 * num_upper + 5), abs=1e-10)
 
 
-@pytest.mark.parametrize("num_upper", [1, 2, 3, 4])
+@pytest.mark.parametrize("num_upper", [1, 4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_small_stars_never_diverge(num_upper: int) -> None:
     with pytest.raises(NoBoundary, match="is stable for every gamma"):
         critical(star(num_upper), "gamma")

@@ -307,7 +307,7 @@ def test_prediction_is_training_on_500_problems() -> None:
 
 
 @pytest.mark.parametrize("sampling", ["expected", "iid", "markov"])
-@pytest.mark.parametrize("seed", [1, 2, 4])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4))])
 def test_redundant_and_turned_features_change_nothing(
     seed: int, sampling: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

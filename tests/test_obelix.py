@@ -185,11 +185,11 @@ def test_clusters_are_what_they_say() -> None:
 
 
 def test_where_there_is_no_room_for_another_cluster_the_likeliest_is_joined() -> None:
-    memory = bit_clusters(2, 1, likelihood=0.2)
-    for y in range(memory.q.shape[0]):
-        bit_update(memory, 0, 0, 10.0 * y, 1.0)
+    memory = bit_clusters(2, 1, likelihood=0.3)
+    for c in range(memory.q.shape[0]):
+        bit_update(memory, int(c == 7), 0, 10.0 + 10.0 * c, 1.0)
     bit_update(memory, 3, 0, -10.0, 0.5)
-    assert bits_remembered(memory) == memory.size[1:].sum() + 1 and memory.size[0, 0] == 2 and memory.q[0, 0] == -5.0
+    assert bits_remembered(memory) == memory.size.sum() - 1 and memory.size[7, 0] == 2 and memory.q[7, 0] == 35.0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,9 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
 
 from neuralq.checks import check_choice
 from neuralq.mdp import AliasedMDP
@@ -23,7 +25,7 @@ from neuralq_envs import dyna
 from neuralq_envs.grids import Grid
 from neuralq_envs.rendering import RenderedEnv
 
-__all__ = ["AliasedGridEnv", "littman", "littman_grid", "make", "mccallum", "mccallum_grid"]
+__all__ = ["AliasedGridEnv", "littman", "littman_grid", "make", "mccallum", "mccallum_grid", "walked"]
 
 _M = """
 .....
@@ -36,7 +38,7 @@ def littman_grid() -> Grid:
     """Sutton's maze with any free cell as a start; each step costs 1, the last one too.
 
     Example:
-        >>> littman_grid().mdp().reward.max()
+        >>> float(littman_grid().mdp().reward.max())
         -1.0
     """
     layout = dyna.grid(random_start=True).layout
@@ -73,6 +75,30 @@ def mccallum(step_reward: float = -0.1, goal_reward: float = 5.0, bump_reward: f
     """
     grid = mccallum_grid(step_reward, goal_reward, bump_reward)
     return AliasedMDP(grid.mdp(), grid.percepts(4))
+
+
+def walked(maze: AliasedMDP, policy: NDArray[np.int64], lost: int) -> NDArray[np.int64]:
+    """Steps from each start by a policy of what is seen, in a maze where nothing is left to chance.
+
+    Args:
+        maze: the maze.
+        policy: an action for each observation, ``[O]``.
+        lost: said of a start from which it never arrives, or takes longer.
+
+    Example:
+        >>> walked(mccallum(), np.array([1, 1, 2, 3, 0, 0]), 200).tolist()
+        [200, 200, 200, 200, 200, 200, 200, 200, 200, 200]
+    """
+    mdp = maze.mdp
+    rows = mdp.row_index[np.arange(mdp.num_states), policy[maze.observation]]
+    s_t = np.where(mdp.termination[rows] < 0.5, np.asarray(mdp.transition.argmax(axis=1)).reshape(-1)[rows], -1)
+    found = []
+    for s in np.flatnonzero(mdp.start_distribution).tolist():
+        steps = 0
+        while s >= 0 and steps <= mdp.num_states:
+            s, steps = int(s_t[s]), steps + 1
+        found.append(lost if s >= 0 else min(steps, lost))
+    return np.array(found)
 
 
 class AliasedGridEnv(gymnasium.Env[Any, Any]):

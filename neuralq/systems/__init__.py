@@ -42,6 +42,8 @@ SYSTEMS = {
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
     ),
+    "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike"),
+    "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory"),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
     "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once"),

@@ -43,6 +43,7 @@ from neuralq.tabular.kernels.zcs import Zcs, ZcsRates, new_zcs, zcs_action, zcs_
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
 from neuralq.tabular.n_step import apply_n_step, n_step
+from neuralq.tabular.nearest_sequences import NearestSequenceMemory
 from neuralq.tabular.options import OptionOutcome, run_option
 from neuralq.tabular.planning import dyna_q, prioritized_sweeping, queue_dyna
 from neuralq.tabular.policies import (
@@ -58,6 +59,7 @@ from neuralq.tabular.policies import (
 from neuralq.tabular.prediction import batch_td, predict, td_lambda, under_policy
 from neuralq.tabular.regions import Region, RegionOperator, RegionPlan, region_dp
 from neuralq.tabular.results import Band, Curve, Experience, Learned, over_seeds
+from neuralq.tabular.suffix_tree import SuffixNode, UtileSuffixMemory
 from neuralq.tabular.theory import Sweeps, robbins_monro_sums, sweep_errors
 from neuralq.tabular.traces import apply_lambda, q_lambda, sarsa_lambda
 
@@ -76,6 +78,7 @@ __all__ = [
     "KToTheQ",
     "Learned",
     "Model",
+    "NearestSequenceMemory",
     "OptionOutcome",
     "Power",
     "RandomPolicy",
@@ -85,8 +88,10 @@ __all__ = [
     "RunOptions",
     "SearchThenConverge",
     "Softmax",
+    "SuffixNode",
     "Sweeps",
     "UpperConfidence",
+    "UtileSuffixMemory",
     "Visits",
     "Zcs",
     "ZcsRates",

