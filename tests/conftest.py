@@ -90,8 +90,12 @@ def probed_once() -> Iterator[None]:
         yield
 
 
-# Two processes that begin with these share no kernel; whoever comes to the networks' later finds them compiled.
-FIRST = ("test_engine", "test_contract_lab_methods")
+# While one process compiles the networks' kernels the other has work that needs none; then one compiles those of single
+# rows and of tables, beside what needs the networks' only. Whoever comes later finds all of them compiled.
+FIRST = (
+    *("test_engine", "test_contract_lab_methods", "test_contract_env_models", "test_lab_critic", "test_lab_critical"),
+    *("test_counterexamples", "test_lab_methods_gradient", "test_corners", "test_contract_target_rules", "test_masks"),
+)
 
 
 def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:

@@ -69,8 +69,9 @@ def _samples(leading: tuple[int, ...], seed: int, dtype: torch.dtype) -> tuple[T
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_values_and_gradients_equal_autograd(layout: Any, dtype: torch.dtype) -> None:
-    """Every body, losses in turn, with and without weights; batches grow, shrink and are empty on one engine."""
-    for body, loss in zip(BODIES, itertools.cycle((Loss(), Loss("huber", 0.8))), strict=False):
+    """Bodies, losses in turn, with and without weights; batches grow, shrink and are empty on one engine."""
+    bodies = BODIES if dtype == torch.float64 else BODIES[::5]  # with which each size, norm and activation is met
+    for body, loss in zip(bodies, itertools.cycle((Loss(), Loss("huber", 0.8))), strict=False):
         fast, slow = _pair(layout, body, loss, dtype)
         for n, leading in enumerate(((9,), (1,), (12,), (0,), (4, 3), ())):
             s, a, target, weight = _samples(leading, n, dtype)
