@@ -13,7 +13,10 @@ from neuralq.systems.hierarchies.studies import COMPOSITE, ENOUGH, ROOM, Study
 from neuralq_envs.landmarks import LANDMARKS, NUM_CELLS, TASKS
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from neuralq.types import Floats
 
 __all__ = ["curve_picture", "modules_picture"]
 
@@ -39,14 +42,7 @@ def modules_picture(study: Study) -> Picture:
         bar = figure.colorbar(image, ax=[grid[landmark] for landmark in LANDMARKS], shrink=0.7, aspect=12)
         assert bar.solids is not None
         bar.solids.set_rasterized(False)  # the page loads no image
-        left = np.zeros(len(stages))
-        for module in range(3):
-            share = study.gates[stages, module]
-            grid["gate"].barh(names, share, left=left, color=COLOURS[module], label=f"module {module + 1}")
-            left += share
-        grid["gate"].set(xlabel="probability of each module", xlim=(0, 1))
-        grid["gate"].invert_yaxis()
-        grid["gate"].grid(visible=False)
+        _paint_gates(grid["gate"], names, study.gates[stages])
         figure.legend(loc="outside lower center", ncols=3, fontsize=9)
 
     said = " ".join(
@@ -60,6 +56,17 @@ def modules_picture(study: Study) -> Picture:
         "of the composite tasks."
     )
     return Picture("Modules and gates", svg, caption)
+
+
+def _paint_gates(axes: Axes, names: Sequence[str], gates: Floats) -> None:
+    """A bar a stage, of what the gate gives to each module, ``[stages, 3]``."""
+    left = np.zeros(len(names))
+    for module in range(3):
+        axes.barh(names, gates[:, module], left=left, color=COLOURS[module], label=f"module {module + 1}")
+        left += gates[:, module]
+    axes.set(xlabel="probability of each module", xlim=(0, 1))
+    axes.invert_yaxis()
+    axes.grid(visible=False)
 
 
 def curve_picture(found: Mapping[str, Sequence[Study]]) -> Picture:
