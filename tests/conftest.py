@@ -107,15 +107,19 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 # What is tried whole takes long: systems whose loops have to be compiled, processes that are started, ended and killed,
 # pages in a browser, pictures. `make whole` runs these, and single tests that are marked `whole`; CI does so too.
 WHOLE = (
-    *("test_backgammon_fuzz", "test_backgammon_learning", "test_backgammon_match", "test_backgammon_run"),
-    *("test_checkers_learning", "test_elevators", "test_job_shop", "test_obelix", "test_thrun_robot_learning"),
-    *("test_bucket_brigade", "test_hierarchies", "test_mccallum"),
+    *("test_backgammon", "test_backgammon_expert", "test_backgammon_fuzz", "test_backgammon_learning"),
+    *("test_backgammon_match", "test_backgammon_oracles", "test_backgammon_play", "test_backgammon_run"),
+    *("test_bucket_brigade", "test_checkers", "test_checkers_learning", "test_elevators", "test_figure_13_2"),
+    *("test_hierarchies", "test_job_shop", "test_mccallum", "test_obelix", "test_thrun_robot_learning"),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals", "test_sweep"),
-    *("test_docs", "test_export_torch", "test_lab_registry", "test_registry", "test_scripts"),
-    *("test_figures", "test_play_page", "test_report", "test_web_page"),
+    *("test_cli_export", "test_docs", "test_export_torch", "test_lab_registry", "test_modules", "test_registry"),
+    *("test_figures", "test_play_page", "test_report", "test_scripts", "test_web_page"),
 )
-FOLDERS = {ROOT / "neuralq" / "systems", ROOT / "envs" / "neuralq_envs" / "job_shop"}
-EXAMPLES = {ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("compositional.py", "zcs.py")}
+FOLDERS = {
+    ROOT / "neuralq" / "systems",
+    *(ROOT / "envs" / "neuralq_envs" / game for game in ("backgammon", "checkers", "job_shop")),
+}
+EXAMPLES = {ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("bits.py", "compositional.py", "zcs.py")}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

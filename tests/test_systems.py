@@ -183,6 +183,7 @@ def test_a_system_is_what_it_says(name: str) -> None:
     assert [row.verdict for row in system.oracle()] == ["agrees"] * len(system.oracle())
 
 
+@pytest.mark.whole
 def test_the_ends_of_q_lambda() -> None:
     plain, lengths = oracle.one_step_training(5, 25)
     ours = train(5, Settings(0.0, most_failures=25))
@@ -191,6 +192,7 @@ def test_the_ends_of_q_lambda() -> None:
     assert oracle.monte_carlo_difference(num_states=30, alpha=0.7, gamma=0.99, seed=3) < 1e-12
 
 
+@pytest.mark.whole
 def test_a_film_of_q_lambda_is_of_its_own_trial() -> None:
     ours = train(2, Settings(0.9, most_failures=9))
     (film,) = film_trials(ours, [8], 10_000)

@@ -230,6 +230,7 @@ def test_several_hooks_from_the_shell_stop_a_run_and_seeds_of_a_sweep(
     assert sweeps._command(sweep, 0)[-4:] == words[-4:]
 
 
+@pytest.mark.whole
 def test_runs_of_other_kinds_say_what_they_do_not_show(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     from neuralq.systems.backgammon import TdGammonConfig
     from neuralq.systems.backgammon.run import train_games
