@@ -68,7 +68,6 @@ def played(client: TestClient, state: dict[str, Any], rng: np.random.Generator) 
     return act(client, state, "confirm")
 
 
-@pytest.mark.whole
 def test_a_game_is_played_to_its_end_and_counted(client: TestClient, agent: BackgammonAgent) -> None:
     rng = np.random.default_rng(1)
     state = post(client, "start", seed=4)

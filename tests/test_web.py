@@ -265,7 +265,6 @@ async def _leaves() -> bool:
     return True
 
 
-@pytest.mark.whole
 def test_a_worker_is_ended_when_it_takes_too_long_and_replaced() -> None:
     slow = {**STAR, "method": "gtd2", "sampling": "iid", "options": {"lambda_": 0.0, "beta_over_alpha": 10.0}}
 
@@ -361,7 +360,6 @@ def test_pages_of_other_sites_get_no_answer(which: str, origin: str | None, allo
         assert (reply.status_code in (200, 422)) == allowed and (reply.status_code == 403) != allowed
 
 
-@pytest.mark.whole
 def test_a_request_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("uvicorn")
     from neuralq.apps.web import patience
