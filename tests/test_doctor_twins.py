@@ -55,8 +55,8 @@ def trained(**settings: Any) -> Case:
     return case_of(lambda: Counting(), both(np.abs), settings=Settings(**settings))
 
 
-def changed(change: Callable[[Any], None]) -> Case:
-    net = two_layers(50)
+def changed(change: Callable[[Any], None], units: int = 50) -> Case:
+    net = two_layers(units)
     with torch.no_grad():
         change(net)
     return case_of(noisy, net)
@@ -188,7 +188,7 @@ TWINS: dict[str, tuple[Made, Made]] = {  # ill, and well
     "R2": (lambda: changed(one_unit_in_all), lambda: changed(untouched)),
     "R3": (lambda: stepping(0.99), lambda: stepping(0.5)),
     "R4": (lambda: moving(1.0), lambda: moving(1e-9)),
-    "R5": (lambda: changed(dead), lambda: changed(untouched)),
+    "R5": (lambda: changed(dead, 600), lambda: changed(untouched, 600)),  # fewer cannot fit it even when they are fresh
     "R6": (lambda: lagging(0.6), lambda: lagging(0.4)),
     "R6a": (lambda: changed(untouched), lambda: changed(tripled)),
     "R7": (lambda: of_width(1), lambda: of_width(64)),
