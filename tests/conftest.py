@@ -93,7 +93,7 @@ def probed_once() -> Iterator[None]:
 # While one process compiles the networks' kernels the other has work that needs none; then one compiles those of single
 # rows and of tables, beside what needs the networks' only. Whoever comes later finds all of them compiled.
 FIRST = (
-    *("test_engine", "test_contract_lab_methods", "test_contract_env_models", "test_lab_critic", "test_lab_critical"),
+    *("test_engine", "test_contract_lab_methods", "test_lab_critic", "test_lab_critical", "test_lab_prescribe"),
     *("test_counterexamples", "test_lab_methods_gradient", "test_corners", "test_contract_target_rules", "test_masks"),
 )
 
@@ -105,7 +105,8 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 
 
 # What is tried whole takes long: systems whose loops have to be compiled, processes that are started, ended and killed,
-# pages in a browser, pictures. `make whole` runs these, and single tests that are marked `whole`; CI does so too.
+# pages in a browser, pictures, and what holds every environment, every update on an accelerator and every case of the
+# doctor. `make whole` runs these, and single tests that are marked `whole`; CI does so too.
 WHOLE = (
     *("test_backgammon", "test_backgammon_expert", "test_backgammon_fuzz", "test_backgammon_learning"),
     *("test_backgammon_match", "test_backgammon_oracles", "test_backgammon_play", "test_backgammon_run"),
@@ -113,14 +114,19 @@ WHOLE = (
     *("test_hierarchies", "test_job_shop", "test_mccallum", "test_obelix", "test_thrun_robot_learning"),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals", "test_sweep"),
     *("test_cli_export", "test_docs", "test_export_torch", "test_lab_registry", "test_modules", "test_registry"),
-    *("test_figures", "test_play", "test_play_page", "test_play_turns", "test_report", "test_scripts"),
-    *("test_play_checkers", "test_web", "test_web_page"),
+    *("test_figures", "test_play", "test_play_checkers", "test_play_page", "test_play_turns", "test_report"),
+    *("test_scripts", "test_web", "test_web_page"),
+    *("test_contract_env_models", "test_envs", "test_envs_tictactoe", "test_fitted", "test_fitted_laws"),
+    *("test_doctor_exam", "test_doctor_twins", "test_no_round_trips"),
 )
 FOLDERS = {
-    ROOT / "neuralq" / "systems",
+    *(ROOT / "neuralq" / room for room in ("systems", "apps/web")),
     *(ROOT / "envs" / "neuralq_envs" / game for game in ("backgammon", "checkers", "job_shop")),
 }
-EXAMPLES = {ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("bits.py", "compositional.py", "zcs.py")}
+EXAMPLES = {
+    *(ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("bits.py", "compositional.py", "zcs.py")),
+    ROOT / "envs" / "neuralq_envs" / "obelix_kernels.py",
+}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -6,6 +6,8 @@ respected by `predict` · an older checkpoint than the newest · a foreign folde
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from gymnasium import spaces
 import neuralq
 from neuralq.learners import OnlineSettings, RolloutSettings
 from neuralq.q import MLP
-from neuralq.runs import RunConfig
+from neuralq.runs import Run, RunConfig
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import RunFolderError
@@ -57,9 +59,21 @@ def bandit(layout: str, masked: bool, reward_scale: float = 0.1) -> RunConfig:
     )  # type: ignore[arg-type]  # fmt: skip
 
 
+Trained = Callable[[str, bool], Run]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    @cache
+    def run(layout: str, masked: bool) -> Run:
+        return neuralq.train(bandit(layout, masked), tmp_path_factory.mktemp("trained") / "run")
+
+    return run
+
+
 @pytest.mark.parametrize("layout", ["table", "linear"])
-def test_values_are_in_the_environments_units_and_actions_are_its_own(layout: str, tmp_path: Path) -> None:
-    run = neuralq.train(bandit(layout, masked=False), tmp_path / "run")
+def test_values_are_in_the_environments_units_and_actions_are_its_own(layout: str, trained: Trained) -> None:
+    run = trained(layout, False)
     agent = neuralq.load(run.run_dir)
     for s in (0, 1):
         assert agent.values(s) == pytest.approx([10, 20, 30], abs=1e-6)
@@ -69,9 +83,8 @@ def test_values_are_in_the_environments_units_and_actions_are_its_own(layout: st
     assert run.greedy_return == 30.0
 
 
-def test_a_mask_of_the_environment_is_part_of_the_state(tmp_path: Path) -> None:
-    run = neuralq.train(bandit("table", masked=True), tmp_path / "run")
-    agent = neuralq.load(run.run_dir)
+def test_a_mask_of_the_environment_is_part_of_the_state(trained: Trained) -> None:
+    agent = neuralq.load(trained("table", True).run_dir)
     assert agent.predict(0, action_mask=[1, 1, 1]) == 7
     assert agent.predict(1, action_mask=[1, 1, 0]) == 6
     assert agent.values(1, action_mask=[1, 1, 0]) == pytest.approx([10, 20, -np.inf])
@@ -79,8 +92,8 @@ def test_a_mask_of_the_environment_is_part_of_the_state(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_wrong_masks_and_observations_are_refused(masked: bool, tmp_path: Path) -> None:
-    agent = neuralq.load(neuralq.train(bandit("table", masked), tmp_path / "run").run_dir)
+def test_wrong_masks_and_observations_are_refused(masked: bool, trained: Trained) -> None:
+    agent = neuralq.load(trained("table", masked).run_dir)
     with pytest.raises(ValueError, match=r"action_mask must have 3 entries, got shape \(2,\)"):
         agent.values(0, action_mask=[1, 1])
     with pytest.raises(ValueError, match="must have 3 entries"):
@@ -159,8 +172,8 @@ def test_a_batch_is_its_rows(cartpole: Path) -> None:
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_masks_of_a_batch(masked: bool, tmp_path: Path) -> None:
-    agent = neuralq.load(neuralq.train(bandit("table", masked), tmp_path / "run").run_dir)
+def test_masks_of_a_batch(masked: bool, trained: Trained) -> None:
+    agent = neuralq.load(trained("table", masked).run_dir)
     states, legal = np.array([0, 1, 1, 0]), np.array([[1, 1, 1], [1, 1, 0], [1, 0, 0], [0, 1, 0]])
     values = agent.values(states, legal)
     assert np.array_equal(np.isfinite(values), legal == 1)

@@ -120,7 +120,6 @@ def _vector(env_id: str) -> gymnasium.vector.VectorEnv:
     return gymnasium.make_vec(env_id, num_envs=3, vectorization_mode="vector_entry_point")
 
 
-@pytest.mark.whole
 def test_importing_the_environments_first_is_as_good() -> None:
     # Gymnasium registers them when it is imported, which then happens in the middle of their own import.
     program = "import neuralq_envs.cliff, gymnasium; gymnasium.make('neuralq/CliffWalking-v0')"

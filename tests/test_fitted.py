@@ -172,7 +172,6 @@ def test_the_divergence_hangs_on_the_symmetry_of_the_start():
     assert tilted.run.max_abs[-1] == pytest.approx(19.88957, rel=1e-6)  # the plane of the paper has 20 at the origin
 
 
-@pytest.mark.whole
 def test_without_an_undiscounted_goal_the_16_grid_neither_diverges_nor_converges():
     """γ = .99 keeps the sweeps bounded, in a cycle: max |V| swings for ever between 16.3976 and 16.4449."""
     found = diagnose_fitted(GRID, GRID16, LeastSquares(), gamma=0.99, num_iterations=3500)
@@ -182,7 +181,6 @@ def test_without_an_undiscounted_goal_the_16_grid_neither_diverges_nor_converges
     assert late.max() == pytest.approx(max(_oracle(16, 0.99, 3500)[-1400:]), rel=1e-5)
 
 
-@pytest.mark.whole
 def test_a_fixed_point_reached_by_symmetry_is_called_unstable():
     found = diagnose_fitted(GRID, GRID16, LeastSquares(), gamma=0.95)
     assert found.run.converged and found.verdict == "unstable" and found.growth > 1.01
@@ -204,7 +202,6 @@ def test_leaving_out_the_goal_diverges_on_every_grid(side):
     assert found.run.growth == pytest.approx(found.ray_growth, rel=1e-5)
 
 
-@pytest.mark.whole
 def test_random_supports_of_one_size_differ_in_their_outcome():
     outcomes = [
         diagnose_fitted(GRID, random_support(GRID, 256, np.random.default_rng(s)), LeastSquares(), num_iterations=2000)
@@ -287,7 +284,6 @@ def test_a_network_is_run_but_never_certified():
     np.testing.assert_array_equal(found.run.values, again.values)
 
 
-@pytest.mark.whole
 def test_a_network_fits_a_bowl_and_repeats_itself():
     fit = NetworkRegressor(num_hidden=10, num_steps=150).fit(GRID16)
     bowl = ((GRID16 - 0.4) ** 2).sum(axis=1)
