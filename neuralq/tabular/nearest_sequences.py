@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuralq.checks import check_discount, check_fraction, check_whole
+from neuralq.tabular.moments import check_moment, double
 
 __all__ = ["NearestSequenceMemory"]
 
@@ -111,12 +112,7 @@ class NearestSequenceMemory:
             ValueError: no trial has begun, another action or observation, or none although the trial goes on.
         """
         self._check_begun()
-        if not 0 <= a < self._num_actions:
-            raise ValueError(f"a must be a whole number from 0 to {self._num_actions - 1}, got {a!r}")
-        if o_t is not None:
-            check_whole("o_t", o_t, 0)
-        elif not terminated:
-            raise ValueError("o_t must be given unless the trial has ended; say terminated=True if it has")
+        check_moment(a, self._num_actions, o_t, terminated)
         voters, target = self._voters[a], r
         self._keep(a)
         if o_t is None or terminated:
@@ -136,9 +132,7 @@ class NearestSequenceMemory:
         """The present moment becomes one of the past, for now worth what its action was thought to be."""
         n = self._num
         if n == len(self._o):
-            for name in ("_o", "_a", "_match", "_q", "_is_first"):
-                old = getattr(self, name)
-                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+            double(self, ("_o", "_a", "_match", "_q", "_is_first"))
         self._o[n], self._a[n], self._q[n], self._is_first[n] = self._now, a, self._values[a], self._begins
         self._num = n + 1
 

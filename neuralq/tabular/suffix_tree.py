@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import kolmogorov
 
 from neuralq.checks import check_discount, check_positive, check_whole
+from neuralq.tabular.moments import check_moment, double
 
 __all__ = ["SuffixNode", "UtileSuffixMemory"]
 
@@ -152,12 +153,7 @@ class UtileSuffixMemory:
             ValueError: no trial has begun, another action or observation, or none although the trial goes on.
         """
         now = self._check_begun()
-        if not 0 <= a < self._num_actions:
-            raise ValueError(f"a must be a whole number from 0 to {self._num_actions - 1}, got {a!r}")
-        if o_t is not None:
-            check_whole("o_t", o_t, 0)
-        elif not terminated:
-            raise ValueError("o_t must be given unless the trial has ended; say terminated=True if it has")
+        check_moment(a, self._num_actions, o_t, terminated)
         self._now = None if o_t is None or terminated else np.array([o_t, a, *now])[: self._depth]
         here_t = -1 if self._now is None else self._find(self._now)
         self._keep(now, a, r, here_t)
@@ -192,9 +188,7 @@ class UtileSuffixMemory:
         """The present moment becomes one of the past."""
         n = self._num
         if n == len(self._r):
-            for name in ("_suffix", "_a", "_leaf", "_leaf_t", "_r"):
-                old = getattr(self, name)
-                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+            double(self, ("_suffix", "_a", "_leaf", "_leaf_t", "_r"))
         self._suffix[n], self._a[n], self._r[n], self._leaf[n], self._leaf_t[n] = suffix, a, r, self._here, leaf_t
         self._num = n + 1
 
