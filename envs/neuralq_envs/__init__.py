@@ -71,6 +71,7 @@ WITHOUT_MODEL = {
         "neuralq_envs.aliased", {"maze": "mccallum"}, has_vector=False, max_episode_steps=200
     ),
     "neuralq/Obelix-v0": Registration("neuralq_envs.obelix", has_vector=False, max_episode_steps=100),
+    "neuralq/Pengo-v0": Registration("neuralq_envs.pengo", has_vector=False, max_episode_steps=60),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
     "neuralq/ThrunRobot-v0": Registration("neuralq_envs.thrun_robot", has_vector=False, max_episode_steps=30),
