@@ -42,6 +42,7 @@ SYSTEMS = {
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
     ),
+    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching"),
     "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike"),
     "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory"),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
