@@ -52,7 +52,10 @@ _STYLE = """
 .contents th[scope=row] { white-space: nowrap; }
 .contents td:nth-of-type(2), .contents td:nth-of-type(3) { color: var(--soft); white-space: nowrap; }
 .contents .wrong { color: var(--warn); font-weight: 600; }
-@media (max-width: 30rem) { .contents td:nth-of-type(3) { display: none; } }
+@media (max-width: 30rem) {
+  .contents td:nth-of-type(2) { white-space: normal; }
+  .contents td:nth-of-type(3) { display: none; }
+}
 """
 
 
