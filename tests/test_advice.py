@@ -275,7 +275,7 @@ def test_a_game_is_filmed_from_its_beginning_to_its_end() -> None:
 def made(late: float, spread: float = 0.1, **given: Any) -> Any:
     returns = [np.array([0.0, 1.0, late + d]) for d in (-spread, spread)]
     games, worth = np.array([0, 10, 100]), dict.fromkeys((*GOOD, *BAD), 1.0)
-    plain = studies.Study(games, returns[0], None, (0.95, 0.7), worth, studies.compiled(network()))
+    plain = studies.Study(games, returns[0], 10, (0.95, 0.7), worth, studies.compiled(network()))
     return tuple(dataclasses.replace(plain, returns=one, **given) for one in returns)
 
 
@@ -326,9 +326,13 @@ def started() -> PengoEnv:
 
 @pytest.mark.slow
 def test_advice_helps_whenever_it_is_given_and_bad_advice_is_unlearned() -> None:
-    found = run_system(system_named("advice"))
-    assert found.reproduced and not found.wrong and len(found.measured[0].values) == system.ADVICE.num_seeds
-    late = {one.what.partition(": return")[0]: np.array(one.values) for one in found.measured}
+    """With seeds of its own: of 16, as the command has them, a mean return is known to 1.3 % only."""
+    seeds = np.random.SeedSequence(2026).spawn(40)
+    found = {
+        name: tuple(system.ADVICE.contenders[name](seed, False) for seed in seeds)
+        for name in (system.NONE, system.FIRST, system.LATE, system.BAD_FIRST, system.BAD_LATE, system.UNITS)
+    }
+    late = {name: np.array([one.late for one in some]) for name, some in found.items()}
     none = late[system.NONE]
 
     def apart(name: str) -> tuple[float, float]:
@@ -338,9 +342,14 @@ def test_advice_helps_whenever_it_is_given_and_bad_advice_is_unlearned() -> None
     for name in (system.FIRST, system.LATE):
         gain, error = apart(name)
         assert gain >= 2 * error
+    assert np.mean([one.followed[0] for one in found[system.LATE]]) >= 0.9
     for name in (system.BAD_FIRST, system.BAD_LATE):
         assert abs(apart(name)[0]) <= 0.05 * none.mean()
-    gain, error = apart(system.UNITS)
-    assert gain < 2 * error and gain < 0.25 * apart(system.FIRST)[0]  # the control that must fail
-    followed = next(row for row in found.rows if row.what.startswith("told after 4,000 games"))
-    assert float(followed.ours) >= 0.9
+    gain, error = apart(system.UNITS)  # the control that must fail
+    assert gain < 2 * error and gain < 0.25 * apart(system.FIRST)[0]
+
+
+@pytest.mark.slow
+def test_the_page_is_made_of_what_came_out() -> None:
+    found = run_system(system_named("advice"), num_seeds=2)
+    assert len(found.measured) == 9 and not found.wrong and len(found.drawings) == 2

@@ -60,7 +60,6 @@ def curve_picture(found: Mapping[str, Sequence[Study]]) -> Picture:
     svg = draw_svg("curves", "Return by games of training", f"In the last quarter: {said}.", (5.2, 4.4), paint)
     caption = (
         "Mean return of the same 200 greedy games, means over seeds, shaded by their standard error. Dotted: when "
-        "something was said. Right after it play may be worse than before, until learning has fitted rules and values "
-        "to each other."
+        "something was said; the first point there is just after it."
     )
     return Picture("Before and after advice", svg, caption)

@@ -121,10 +121,16 @@ def _no_gain(found: Mapping[str, tuple[Study, ...]]) -> Row:
     )
 
 
+def _when(late: tuple[Study, ...]) -> int:
+    """The test at which these were told."""
+    return int(np.searchsorted(late[0].games, late[0].told_at or 0))
+
+
 def _text(found: Mapping[str, tuple[Study, ...]], claims: tuple[Row, ...]) -> tuple[str, ...]:
     held = all(row.verdict == "agrees" for row in claims)
     first, late = difference(found[FIRST], found[NONE])[0], difference(found[LATE], found[NONE])[0]
     early = [np.mean([one.returns[1:5].mean() for one in found[name]]) for name in (FIRST, NONE)]
+    told = {name: np.mean([one.returns[_when(found[LATE])] for one in found[name]]) for name in (NONE, LATE, BAD_LATE)}
     return (
         f"{'Reproduced' if held else 'Not reproduced with these seeds'}: who is told 16 plain rules plays better for "
         f"good, whenever that is. In the last quarter of 8,000 games it is {first:+.2f} for who was told at the start "
@@ -140,8 +146,8 @@ def _text(found: Mapping[str, tuple[Study, ...]], claims: tuple[Row, ...]) -> tu
         f"{_followed(found[FIRST], True):.2f}: the rules are not always right. Nor are all of use: those on what is "
         f"farther away come to {_mean(found[FARTHER]):.2f} alone, those on what is beside the player to "
         f"{_mean(found[BESIDE]):.2f}; that much is soon found out without advice.",
-        "Who is told late plays worse just after it: what was learned without the rules and what the rules add are too "
-        "much together. Bad advice, to leave food alone and to walk into enemies, costs most there, and is unlearned.",
+        f"Told after 4,000 games, play goes from {told[NONE]:.2f} to {told[LATE]:.2f} before anything more is learned. "
+        f"Bad advice, to leave food alone and to walk into enemies, takes it to {told[BAD_LATE]:.2f}, and is unlearned.",
     )
 
 
