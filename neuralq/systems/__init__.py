@@ -36,6 +36,7 @@ SYSTEMS = {
         "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods"
     ),
     "checkers": SystemEntry("neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote"),
+    "child": SystemEntry("neuralq.systems.child:CHILD", "nine mazes, each learned with what the last ones taught"),
     "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen"),
     "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop"),
     "hierarchies": SystemEntry("neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills"),
