@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +18,18 @@ from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
-from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, SeparateQ, TableQ, body_for
+from neuralq.q import (
+    ActionInputQ,
+    ActionOutputQ,
+    DuelingQ,
+    LinearQ,
+    MaskedQ,
+    Rule,
+    SeparateQ,
+    TableQ,
+    body_for,
+    insert_rules,
+)
 from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
@@ -94,6 +105,8 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
         else:
             q = _NETWORKS[config.layout](shape, num_outputs, body, features, rng)
     q = config.kind.represent(q, config.settings, config.reward_scale, rng)
+    if config.rules:
+        q = insert_rules(q, cast("tuple[Rule, ...]", config.rules))
     return MaskedQ(q, spec.inner_shape) if spec.masked else q
 
 
