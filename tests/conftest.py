@@ -125,15 +125,9 @@ FOLDERS = {
     *(ROOT / "envs" / "neuralq_envs" / game for game in ("backgammon", "checkers", "job_shop", "lin_world")),
 }
 EXAMPLES = {
-<<<<<<< HEAD
-    *(
-        ROOT / "neuralq" / "tabular" / "kernels" / name
-        for name in ("bits.py", "compositional.py", "transition_hierarchy.py", "zcs.py")
-    ),
-=======
     *(ROOT / "neuralq" / "tabular" / "kernels" / name for name in ("bits.py", "compositional.py", "zcs.py")),
+    ROOT / "neuralq" / "tabular" / "kernels" / "transition_hierarchy.py",
     *(ROOT / "neuralq" / "learners" / name for name in ("lessons.py", "turned.py")),
->>>>>>> main
     ROOT / "envs" / "neuralq_envs" / "obelix_kernels.py",
 }
 
