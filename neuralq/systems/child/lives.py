@@ -112,7 +112,7 @@ def live(
     Example:
         >>> life = live(0, mazes=(1, 2))
         >>> life.solved, life.num_units
-        ((True, True), (0, 0))
+        ((True, True), (0, 1))
     """
     check_whole("limit", limit)
     check_fraction("epsilon", settings.epsilon)
