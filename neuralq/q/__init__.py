@@ -5,7 +5,7 @@ actions named, and the second always equals the first gathered at ``a``. What di
 moves along with the one it was meant for, and that is what decides whether training converges.
 """
 
-from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
+from neuralq.q.bodies import MLP, Conv
 from neuralq.q.custom import BODIES, Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
@@ -13,10 +13,13 @@ from neuralq.q.flat import FlatParameters
 from neuralq.q.implicit import ImplicitQuantileQ
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
+from neuralq.q.named_bodies import NAMED_BODIES, body_for
+from neuralq.q.recurrent import GRU, RecurrentQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
 
 __all__ = [
     "BODIES",
+    "GRU",
     "MLP",
     "NAMED_BODIES",
     "ActionInputQ",
@@ -31,6 +34,7 @@ __all__ = [
     "LinearQ",
     "MaskedQ",
     "QuantileQ",
+    "RecurrentQ",
     "SeparateQ",
     "TableQ",
     "body_for",

@@ -91,5 +91,5 @@ def export(run: Any, path: str | Path, to: str | None = None, best: bool | None 
         python, difference = write_torch(agent, config, out, seen)
         return Exported(out, to, folder, difference, len(seen.values), python=python)
     difference, allowed = write_onnx(agent, config, out, seen)
-    inputs = described(agent, raw_inputs(agent, seen.observations, seen.masks))
+    inputs = described(agent, raw_inputs(agent, seen.observations, seen.masks, seen.memories))
     return Exported(out, to, folder, difference, len(seen.values), inputs=inputs, allowed=allowed)
