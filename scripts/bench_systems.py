@@ -79,6 +79,15 @@ def obelix_behaviours(num_steps: int) -> None:
     spend(0, "behaviours", "table", num_steps=max(num_steps, 4))
 
 
+def lin_replay(num_plays: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.lin.trainings import TEST_EVERY, Settings, train
+
+    settings = Settings(replays=(12, 4), num_plays=max(num_plays, TEST_EVERY), num_test_plays=1)
+    train(np.random.SeedSequence(0), settings)
+
+
 def littman_sarsa(num_steps: int) -> None:
     from neuralq.systems.littman.trainings import train
 
@@ -132,6 +141,7 @@ WORK = {
     "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "hierarchies": Work("4,000 trials of CQ-L, half of them composite", compositional, 2000, 50),
     "job-shop": Work("6,000 episodes of repair, 51 tasks", job_shop, 6000, 20, most_seconds=5.0),
+    "lin": Work("300 plays of QCON-R in Lin's world", lin_replay, 300, 25),
     "littman": Work("1,000,000 steps of Sarsa(λ) on percepts", littman_sarsa, 1_000_000, 2000),
     "mccallum": Work("200 trials of USM in the M", mccallum_tree, 200, 200),
     "obelix": Work("8,000 steps of three behaviours, table", obelix_behaviours, 8000, 200),

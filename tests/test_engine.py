@@ -33,6 +33,7 @@ HIDDEN = ((), (5,), (7, 6), (5, 4, 3), (41,), (33, 70))  # the last two wide eno
 BODIES = [
     MLP(h, norm, act) for h, norm, act in itertools.product(HIDDEN, (False, True), ("relu", "tanh", "leaky_relu"))
 ]
+BODIES += [MLP((7, 6), norm, "sigmoid") for norm in (False, True)]
 DTYPES = (torch.float64, torch.float32)
 
 

@@ -25,7 +25,7 @@ from safetensors.torch import load_file
 import neuralq
 from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings
-from neuralq.q import MLP, Conv
+from neuralq.q import MLP, Conv, Rule
 from neuralq.q.custom import Custom
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
@@ -74,6 +74,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "composed": ("dict", NORMED),
     "noisy": ("vector", NOISY),
     "noisy and separate": ("start", {"layout": "separate", **NOISY}),
+    "advised": ("vector", {"body": MLP((8,), activation="sigmoid"), "rules": (Rule({0: True, 3: False}, 1),)}),
 }
 
 

@@ -359,6 +359,7 @@ def test_it_is_the_published_program() -> None:
 NORMED = {"layer_norm": True, "activation": "leaky_relu", "sparsity": 0.5}
 NETWORKS: dict[str, tuple[tuple[int, ...], Any]] = {
     "plain": ((3,), MLP((8, 7))),
+    "sigmoid": ((3,), MLP((8, 7), activation="sigmoid")),
     "tanh, no hidden": ((3,), MLP((), activation="tanh")),
     "normed": ((3,), MLP((8, 7), True, "tanh")),
     "normed, no scale": ((3,), MLP((8, 7), affine=False, **NORMED)),

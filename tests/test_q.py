@@ -158,7 +158,7 @@ def _plain_net(q: Any, copy: int) -> nn.Sequential:
     stem, trunk = q.input.stem, q.trunk
     num_copies = trunk.copies
     layers: list[nn.Module] = []
-    activations = {"relu": nn.ReLU, "tanh": nn.Tanh, "leaky_relu": nn.LeakyReLU}
+    activations = {"relu": nn.ReLU, "tanh": nn.Tanh, "leaky_relu": nn.LeakyReLU, "sigmoid": nn.Sigmoid}
     act = activations[trunk.activation]
     if stem is not None:
         for i, weight in enumerate(stem.weights):

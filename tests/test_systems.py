@@ -73,13 +73,13 @@ def dice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     folder.mkdir()
     (folder / "__init__.py").write_text(DICE)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(SYSTEMS, "dice", SystemEntry("dice_system:DICE", "two dice"))
+    monkeypatch.setitem(SYSTEMS, "dice", SystemEntry("dice_system:DICE", "two dice", 5))
     monkeypatch.chdir(tmp_path)
     return __import__("dice_system")
 
 
 def test_a_folder_and_a_line_make_a_system_of_the_command(dice: Any, capsys: Capture) -> None:
-    assert main(["chapter"]) == 0 and "two dice" in capsys.readouterr().out.splitlines()[-1]
+    assert main(["chapter"]) == 0 and "  dice            two dice" in capsys.readouterr().out
     assert main(["chapter", "dice", "--json"]) == 0  # although a published claim did not come out
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     seeds = np.random.SeedSequence(0).spawn(7)

@@ -57,6 +57,7 @@ ENVIRONMENTS = {
 WITHOUT_MODEL = {
     "neuralq/Backgammon-v0": Registration("neuralq_envs.backgammon.single_agent", has_vector=False),
     "neuralq/Checkers-v0": Registration("neuralq_envs.checkers.single_agent", has_vector=False),
+    "neuralq/LinWorld-v0": Registration("neuralq_envs.lin_world.environment", has_vector=False),
     "neuralq/LinearQuadratic-v0": Registration(
         "neuralq_envs.linear_quadratic", has_vector=False, max_episode_steps=100
     ),

@@ -19,6 +19,9 @@ Where those diverge, others converge: `ResidualGradientLearner` descends the Bel
 
 `learn_afterstates` learns values of what actions lead to, so that there may be others in every state (TD(λ), compiled).
 
+`turned_q_update` and `turned_actor_critic_update` judge actions that are each other's rotations by one network, and
+`Lessons` keeps whole episodes, a teacher's too, to live through them again (compiled).
+
 `fit_slopes` fits a small network to values and slopes at once, for whoever has a model that explains what was seen.
 
 A learner that runs can be made of ends with its `LearnerKind`; `learner_kinds` finds it, and nothing else lists it.
@@ -39,6 +42,15 @@ from neuralq.learners.gradient.settings import GradientSettings
 from neuralq.learners.gradient.step import GradientTDSettings
 from neuralq.learners.kind import LearnerKind, Parts, Representation, Traits, learner_kinds
 from neuralq.learners.learner import HasEngineName, HasValues, Learner, Update
+from neuralq.learners.lessons import (
+    Lessons,
+    begin_lesson,
+    new_lessons,
+    note_step,
+    recent_lesson,
+    replay_actor_critic,
+    replay_q,
+)
 from neuralq.learners.replay.distributional import DistributionalLearner
 from neuralq.learners.replay.dqrc import DQRCLearner, TwinHead
 from neuralq.learners.replay.learner import ReplayLearner
@@ -55,6 +67,16 @@ from neuralq.learners.tabular.learner import TabularLearner
 from neuralq.learners.tabular.settings import TabularSettings
 from neuralq.learners.traces.learner import OnlineLearner, OnlineSettings, PredictionLearner
 from neuralq.learners.traces.streaming import StreamingLearner, StreamingSettings
+from neuralq.learners.turned import (
+    TurnedNetwork,
+    new_turned_network,
+    turned_action,
+    turned_actor_critic_update,
+    turned_policy,
+    turned_q_update,
+    turned_update,
+    turned_values,
+)
 
 __all__ = [
     "DQRCLearner",
@@ -69,6 +91,7 @@ __all__ = [
     "HeadCorrection",
     "Learner",
     "LearnerKind",
+    "Lessons",
     "OnlineLearner",
     "OnlineSettings",
     "Parts",
@@ -88,17 +111,31 @@ __all__ = [
     "TabularSettings",
     "TangentCorrection",
     "Traits",
+    "TurnedNetwork",
     "TwinHead",
     "Update",
     "ValueNetwork",
+    "begin_lesson",
     "choose_afterstate",
     "fit_slopes",
     "learn_afterstates",
     "learner_kinds",
+    "new_lessons",
     "new_slope_net",
     "new_smdp_network",
+    "new_turned_network",
     "new_value_network",
+    "note_step",
+    "recent_lesson",
+    "replay_actor_critic",
+    "replay_q",
     "smdp_network_update",
     "smdp_network_values",
+    "turned_action",
+    "turned_actor_critic_update",
+    "turned_policy",
+    "turned_q_update",
+    "turned_update",
+    "turned_values",
     "value_of",
 ]

@@ -5,6 +5,7 @@ actions named, and the second always equals the first gathered at ``a``. What di
 moves along with the one it was meant for, and that is what decides whether training converges.
 """
 
+from neuralq.q.advice import Rule, insert_rules
 from neuralq.q.bodies import MLP, Conv
 from neuralq.q.custom import BODIES, Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
@@ -35,7 +36,9 @@ __all__ = [
     "MaskedQ",
     "QuantileQ",
     "RecurrentQ",
+    "Rule",
     "SeparateQ",
     "TableQ",
     "body_for",
+    "insert_rules",
 ]

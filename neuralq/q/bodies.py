@@ -37,7 +37,7 @@ __all__ = [
     "Trunk",
 ]
 
-ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.functional.leaky_relu}
+ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.functional.leaky_relu, "sigmoid": torch.sigmoid}
 
 
 _INITS = ("uniform", "he")
@@ -238,7 +238,7 @@ class MLP:
     Args:
         hidden: widths of the hidden layers; empty for a linear function with a bias.
         layer_norm: layer normalisation before each activation, as in PQN (Gallici et al., 2024).
-        activation: "relu", "tanh" or "leaky_relu" (slope 0.01).
+        activation: "relu", "tanh", "leaky_relu" (slope 0.01) or "sigmoid".
         affine: whether layer normalisation learns a scale and a shift.
         sparsity: fraction of every unit's weights that start at zero, below 1.
         init: how the other weights start, "uniform" or "he".

@@ -33,7 +33,7 @@ class Custom:
         settings: keyword arguments of the class; plain values, which a configuration can hold.
         hidden: widths of dense layers between the features and the values.
         layer_norm: layer normalisation in those layers.
-        activation: of those layers: "relu", "tanh" or "leaky_relu".
+        activation: of those layers: "relu", "tanh", "leaky_relu" or "sigmoid".
 
     Raises:
         ValueError: if ``module`` names no class, or is no name.

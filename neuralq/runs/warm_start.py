@@ -10,11 +10,12 @@ import dataclasses
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
+from neuralq.q import Rule, insert_rules
 from neuralq.runs.agent import Agent
 from neuralq.runs.folder.run_folder import read_config
 from neuralq.runs.loop import seed_for
@@ -49,17 +50,26 @@ def begun_from(config: RunConfig, session: Session, load: Callable[[Path], Agent
     agent = load(Path(path))
     q = session.learner.engine.q
     assert isinstance(agent.q, nn.Module) and isinstance(q, nn.Module)
+    found = _digest(_weights(agent.q))
+    if config.rules:
+        agent.q = insert_rules(agent.q, cast("tuple[Rule, ...]", config.rules))
     if (what := _mismatch(agent, read_config(path), q, config, session)) is not None:
         raise ValueError(f"cannot begin with the weights of {path}: {what}")
-    weights = torch.cat([p.detach().reshape(-1) for p in agent.q.parameters()])
-    found = hashlib.sha256(weights.cpu().contiguous().numpy().tobytes()).hexdigest()
     if named and found != named:
         raise ValueError(
             f"{path} has other weights than those that the run was to begin with (sha256 {found[:12]}…, not "
             f"{named[:12]}…); to begin a run with them as they are now: --warm-start {path}"
         )
-    _begin(session, weights, agent, seed_for(config.seed, 0))
+    _begin(session, _weights(agent.q), agent, seed_for(config.seed, 0))
     return dataclasses.replace(config, warm_start=f"{path}{_SEAL}{found}")
+
+
+def _weights(q: Any) -> Tensor:
+    return torch.cat([p.detach().reshape(-1) for p in q.parameters()])
+
+
+def _digest(weights: Tensor) -> str:
+    return hashlib.sha256(weights.cpu().contiguous().numpy().tobytes()).hexdigest()
 
 
 def _mismatch(agent: Agent, there: Any, q: nn.Module, config: RunConfig, session: Session) -> str | None:

@@ -24,30 +24,39 @@ __all__ = ["SYSTEMS", "System", "SystemEntry", "run_system", "system_named"]
 
 
 class SystemEntry(NamedTuple):
-    """Where a system is, as "module:name", and what it shows in one line."""
+    """Where a system is, as "module:name", what it shows in one line, CPU-seconds that it takes, and its section."""
 
     home: str
     summary: str
+    seconds: int = 0
+    section: str = "13.8"
 
 
 SYSTEMS = {
-    "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic"),
+    "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic", 10),
     "bucket-brigade": SystemEntry(
-        "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods"
+        "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods", 35
     ),
-    "checkers": SystemEntry("neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote"),
-    "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen"),
-    "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop"),
-    "hierarchies": SystemEntry("neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills"),
+    "checkers": SystemEntry(
+        "neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote", 85
+    ),
+    "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen", 40),
+    "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop", 85),
+    "hierarchies": SystemEntry(
+        "neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills", 105
+    ),
     "job-shop": SystemEntry(
-        "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules"
+        "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules", 95
     ),
-    "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike"),
-    "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory"),
-    "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours"),
-    "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)"),
-    "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once"),
-    "thrun-robot": SystemEntry("neuralq.systems.thrun_robot:THRUN_ROBOT", "a robot that explains its way to a target"),
+    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching", 60),
+    "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike", 10),
+    "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory", 25),
+    "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours", 25),
+    "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)", 15),
+    "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once", 175),
+    "thrun-robot": SystemEntry(
+        "neuralq.systems.thrun_robot:THRUN_ROBOT", "a robot that explains its way to a target", 100
+    ),
 }
 
 R = TypeVar("R")

@@ -28,7 +28,7 @@ _EXAMPLES = """examples:
   neuralq train my_package:MyEnv-v0 --lambda 0.8 --hidden 64,64
   neuralq train CartPole-v1 --print-config > run.yaml; neuralq train --config run.yaml --seed 4"""
 
-_OWN_PARSING = {"env", "env_kwargs", "wrappers", "learner", "layout", "body", *LEARNERS}
+_OWN_PARSING = {"env", "env_kwargs", "wrappers", "learner", "layout", "body", "rules", *LEARNERS}
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,14 @@ _MORE: tuple[tuple[str, Any, str, str], ...] = (
     ),
     ("hidden", str, "N,N", "widths of the hidden layers, e.g. 64,64"),
     ("layer_norm", bool | None, "{true,false}", "layer normalisation in the network"),
-    ("activation", str, "NAME", "relu, tanh or leaky_relu"),
+    ("activation", str, "NAME", "relu, tanh, leaky_relu or sigmoid"),
+    (
+        "rules",
+        tuple[dict[str, Any], ...],
+        "LIST",
+        "advice that begins as units of the network: '[{conditions: {2: [0, 0.1]}, action: 1, value: 5}]' makes "
+        "action 1 worth 5 more where input 2 has gone from 0 to .1 (docs/runs.md)",
+    ),
     ("config", str, "FILE", "YAML file of options, as --print-config writes it"),
     ("run_dir", str, "FOLDER", "where the run goes (default: a folder under runs/)"),
     ("preset", str, "NAME", f"true (the environment's), false, or a whole agent: {', '.join(AGENTS)} (default: true)"),

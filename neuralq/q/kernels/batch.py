@@ -52,6 +52,8 @@ def _activate(v: float, activation: int) -> float:
         return v if v > 0 else v * 0
     if activation == 1:
         return math.tanh(v)
+    if activation == 3:
+        return 1 / (1 + math.exp(-v))
     return v if v > 0 else v * 0.01
 
 
@@ -141,13 +143,16 @@ def _forward(
 
 @reassociating_kernel
 def through_activation(d: Array, y: Array, activation: int) -> None:
-    """Multiply ``d [n]`` by the activation's derivative, which all three give from the output ``y [n]`` alone."""
+    """Multiply ``d [n]`` by the activation's derivative, which all four give from the output ``y [n]`` alone."""
     if activation == 0:
         for j in range(d.size):
             d[j] = d[j] if y[j] > 0 else d.dtype.type(0)
     elif activation == 1:
         for j in range(d.size):
             d[j] *= d.dtype.type(1) - y[j] * y[j]
+    elif activation == 3:
+        for j in range(d.size):
+            d[j] *= y[j] * (d.dtype.type(1) - y[j])
     else:
         for j in range(d.size):
             d[j] = d[j] if y[j] > 0 else d[j] * d.dtype.type(0.01)

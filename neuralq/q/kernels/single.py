@@ -107,6 +107,9 @@ def _activate(y: Array, activation: int) -> None:
     elif activation == 1:
         for j in range(y.size):
             y[j] = math.tanh(y[j])
+    elif activation == 3:
+        for j in range(y.size):
+            y[j] = 1 / (1 + math.exp(-y[j]))
     else:
         for j in range(y.size):
             y[j] = y[j] * y.dtype.type(0.01) if y[j] <= 0 else y[j]

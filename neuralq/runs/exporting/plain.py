@@ -14,7 +14,7 @@ from neuralq.types import QFunction
 
 __all__ = ["Plain", "plain_network"]
 
-_ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "leaky_relu": nn.LeakyReLU}
+_ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "leaky_relu": nn.LeakyReLU, "sigmoid": nn.Sigmoid}
 
 
 @dataclass(frozen=True)

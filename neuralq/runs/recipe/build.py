@@ -9,7 +9,7 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +19,19 @@ from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
-from neuralq.q import ActionInputQ, ActionOutputQ, DuelingQ, LinearQ, MaskedQ, RecurrentQ, SeparateQ, TableQ, body_for
+from neuralq.q import (
+    ActionInputQ,
+    ActionOutputQ,
+    DuelingQ,
+    LinearQ,
+    MaskedQ,
+    RecurrentQ,
+    Rule,
+    SeparateQ,
+    TableQ,
+    body_for,
+    insert_rules,
+)
 from neuralq.q.compiled import MlpEngine, array_values, make_engine
 from neuralq.q.engine import Engine
 from neuralq.q.inputs import OneHot, Pixels
@@ -102,6 +114,8 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
         dtype = None if features is None else torch.from_numpy(np.zeros((), spec.inner_dtype)).dtype
         q = RecurrentQ(q, spec.inner_shape, features, dtype)
     q = config.kind.represent(q, config.settings, config.reward_scale, rng)
+    if config.rules:
+        q = insert_rules(q, cast("tuple[Rule, ...]", config.rules))
     inner_shape = (math.prod(spec.inner_shape) + spec.memory_size,) if spec.memory_size else spec.inner_shape
     return MaskedQ(q, inner_shape) if spec.masked else q
 

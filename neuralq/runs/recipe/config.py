@@ -13,7 +13,7 @@ import numpy as np
 
 from neuralq.checks import MOST_WHOLE, check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
-from neuralq.q import BODIES, GRU, MLP, NAMED_BODIES, Body, Custom
+from neuralq.q import BODIES, GRU, MLP, NAMED_BODIES, Body, Custom, Rule
 from neuralq.runs.recipe.games import is_screen
 from neuralq.runs.recipe.remembering import check_memory
 from neuralq.runs.recipe.wrapping import check_wrappers
@@ -93,6 +93,8 @@ class RunConfig:
         epsilon_decay_steps: environment steps.
         body: network body, MLP, Conv, GRU (which remembers) or Custom (a module of your own); networks only. None picks
             MLP, or Conv for images.
+        rules: advice that begins as units of the network, one in each hidden layer for a rule, beside those of the body
+            (`neuralq.q.Rule`, or a mapping of its fields); three layouts with an MLP, without layer normalisation.
         dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
         evaluate_every: environment steps between greedy evaluations.
         evaluation_episodes: episodes of each evaluation.
@@ -130,6 +132,7 @@ class RunConfig:
     epsilon_end: float = 0.05
     epsilon_decay_steps: int = 20_000
     body: Body | None = None
+    rules: tuple[Rule | dict[str, Any], ...] = ()
     dueling: bool = False
     if TYPE_CHECKING:  # which learners there are is found out when the program runs; type checkers know ours
         gradient: GradientSettings | None = None
@@ -162,6 +165,7 @@ class RunConfig:
             "", {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}, RunConfig
         ).items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "rules", tuple(map(_rule_of, self.rules)))
         check_choice("learner", self.learner, LEARNERS)
         object.__setattr__(self, "layout", layout_for(self.learner, self.layout))
         check_choice("layout", self.layout, LAYOUTS)
@@ -222,8 +226,23 @@ def _check_body(config: RunConfig) -> None:
         what = "table" if config.layout == "table" else "linear function"
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
     check_memory(config)
+    if config.rules and config.layout not in NETWORKS:
+        what = "table" if config.layout == "table" else "linear function"
+        raise ValueError(
+            f"a {what} has no units that rules could be; leave rules out or choose one of {', '.join(NETWORKS)}"
+        )
     if config.engine == "compiled" and (config.layout not in NETWORKS or not isinstance(config.body or MLP(), MLP)):
         raise ValueError("engine='compiled' has kernels for MLP networks only; use engine='auto'")
+
+
+def _rule_of(given: Any) -> Rule:
+    """A rule, or the fields of one."""
+    if isinstance(given, Rule):
+        return given
+    _refuse_unknown("a rule", given, Rule)
+    if not {"conditions", "action"} <= set(given):
+        raise ValueError(f"a rule needs conditions and an action, got {given!r}")
+    return Rule(**given)
 
 
 def _check_single(config: RunConfig) -> None:

@@ -32,8 +32,9 @@ _STYLE = """
 }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); font: 1rem/1.55 system-ui, sans-serif; }
-main, header, footer { max-width: 46rem; margin: 0 auto; padding: 0 1rem; }
+main, header, footer, nav { max-width: 46rem; margin: 0 auto; padding: 0 1rem; }
 header { padding-top: 1.5rem; }
+nav { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; padding-top: .8rem; padding-bottom: .4rem; }
 h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 .25rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .5rem; }
 p { margin: .6rem 0; max-width: 40rem; overflow-wrap: anywhere; }
@@ -74,6 +75,7 @@ class Page:
         title: of the document.
         lead: a sentence below it.
         style: more of a style sheet, put after the page's own.
+        links: to other pages, each its words and its address; above and below everything else.
 
     Example:
         >>> page = Page("Run <1>")
@@ -85,6 +87,7 @@ class Page:
     title: str
     lead: str = ""
     style: str = ""
+    links: Sequence[tuple[str, str]] = ()
     _body: list[str] = field(default_factory=list)
     _has_pictures: bool = False
 
@@ -126,6 +129,7 @@ class Page:
         """The whole document."""
         lead = f'\n<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
         body = "\n".join(self._body)
+        links = self._links()
         pictures = "; img-src data:" if self._has_pictures else ""
         return f"""<!DOCTYPE html>
 <html lang="en">
@@ -137,16 +141,22 @@ class Page:
 <style>{_STYLE}{self.style}</style>
 </head>
 <body>
-<header>
+{links}<header>
 <h1>{escape(self.title)}</h1>{lead}
 </header>
 <main>
 {body}
 </main>
-<footer>Written by neuralq. This page is one file: it loads nothing and runs nothing.</footer>
+{links}<footer>Written by neuralq. This page is one file: it loads nothing and runs nothing.</footer>
 </body>
 </html>
 """
+
+    def _links(self) -> str:
+        if not self.links:
+            return ""
+        words = " ".join(f'<a href="{escape(address, quote=True)}">{escape(text)}</a>' for text, address in self.links)
+        return f"<nav>{words}</nav>\n"
 
     def write(self, path: Path) -> Path:
         """Writes the document in one move: a reader sees the old page or the new one, never half of one."""
