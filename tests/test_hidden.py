@@ -43,10 +43,11 @@ def test_hidden_velocities_are_found_and_shown_ones_are_not() -> None:
 def test_what_cannot_be_told_is_said(given: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         hidden_state("CartPole-v1", **given)
+
+
+def test_wide_observations_are_refused() -> None:
+    wide = gym.spaces.Box(0, 1, (300,), np.float64)
     with pytest.raises(ValueError, match="up to 200 are regressed on"):
         hidden_state(
-            lambda: gym.wrappers.TransformObservation(
-                gym.make("CartPole-v1"), lambda o: np.zeros(300), gym.spaces.Box(0, 1, (300,), np.float64)
-            ),
-            num_episodes=10,
+            lambda: gym.wrappers.TransformObservation(gym.make("CartPole-v1"), lambda o: np.zeros(300), wide), 10
         )

@@ -1,4 +1,4 @@
-"""What networks with a memory must reach where state is hidden, and what those without one must not: ten fresh seeds."""
+"""What networks with a memory must reach where state is hidden, and those without one must not; ten fresh seeds."""
 
 from __future__ import annotations
 
