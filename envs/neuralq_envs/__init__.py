@@ -75,6 +75,7 @@ WITHOUT_MODEL = {
     "neuralq/Pengo-v0": Registration("neuralq_envs.pengo", has_vector=False, max_episode_steps=60),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
+    "neuralq/RingMaze-v0": Registration("neuralq_envs.ring_mazes", has_vector=False, max_episode_steps=1000),
     "neuralq/ThrunRobot-v0": Registration("neuralq_envs.thrun_robot", has_vector=False, max_episode_steps=30),
     "neuralq/Woods1-v0": Registration("neuralq_envs.woods", has_vector=False, max_episode_steps=500),
 }

@@ -147,7 +147,7 @@ def _text(found: Mapping[str, tuple[Study, ...]], claims: tuple[Row, ...]) -> tu
         f"farther away come to {_mean(found[FARTHER]):.2f} alone, those on what is beside the player to "
         f"{_mean(found[BESIDE]):.2f}; that much is soon found out without advice.",
         f"Told after 4,000 games, play goes from {told[NONE]:.2f} to {told[LATE]:.2f} before anything more is learned. "
-        f"Bad advice, to leave food alone and to walk into enemies, takes it to {told[BAD_LATE]:.2f}, and is unlearned.",
+        f"Bad advice, to leave food alone and to walk into enemies, takes it to {told[BAD_LATE]:.2f} and is unlearned.",
     )
 
 
