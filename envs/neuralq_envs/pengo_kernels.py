@@ -8,7 +8,7 @@ and else to the free cell beside it that is nearest to the player; food and bloc
 
 The player sees 44 inputs between 0 and 1: for each of the four cells beside it, which of wall, free, block, food and
 enemy it is; and for each of eight sectors, north first and clockwise, how near the nearest block, food and enemy are,
-min(1, 3/d) at d steps, 0 for none.
+1/d at d steps, 0 for none.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ __all__ = [
     "BLOCK",
     "FOOD",
     "FREE",
-    "NEAR",
     "NUM_ACTIONS",
     "NUM_DEALT",
     "NUM_DRAWN",
@@ -49,8 +48,6 @@ NUM_DEALT, NUM_DRAWN = SIDE * SIDE - 1, 2 * NUM_ENEMIES
 """Random numbers for a board, and for the enemies after an action."""
 FREE, BLOCK, FOOD = range(3)
 """What lies in a cell."""
-NEAR = 1
-"""Steps within which something is as near as it can be seen to be."""
 FOOD_REWARD, KILL_REWARD, CAUGHT_REWARD = 1.0, 0.9, -1.0
 _APART = 2  # steps from the player within which no enemy begins
 _KINDS = ("wall", "free", "block", "food", "enemy")
@@ -163,7 +160,7 @@ def look(game: Game, x: NDArray[np.float64]) -> None:
         >>> game.player[0], game.cells[25], game.enemies[0] = 24, FOOD, 10
         >>> look(game, x)
         >>> np.flatnonzero(x).tolist(), x[[input_of("food", sector=2), input_of("enemy", sector=0)]].tolist()
-        ([1, 8, 11, 16, 22, 27], [1.0, 1.0])
+        ([1, 8, 11, 16, 22, 27], [1.0, 0.5])
     """
     for i in range(len(x)):
         x[i] = 0.0
@@ -188,7 +185,7 @@ def _see(player: int, cell: int, kind: int, x: NDArray[np.float64]) -> None:
     if cell == player:
         return
     at = 20 + 3 * sector_of(cell // SIDE - player // SIDE, cell % SIDE - player % SIDE) + kind
-    x[at] = max(x[at], min(1.0, NEAR / steps_between(player, cell)))
+    x[at] = max(x[at], 1.0 / steps_between(player, cell))
 
 
 @lean_kernel
