@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch import nn
 
+from neuralq.doctor import hidden
 from neuralq.doctor.estimates import td_against_monte_carlo
 from neuralq.doctor.exam import aliasing, capacity, environment, exactly, hypotheses, network, signs, stored, values
 from neuralq.doctor.exam.case import CannotMeasure, Case, begin
@@ -41,7 +42,7 @@ def few_episodes() -> Iterator[None]:
             patch.setattr(f"neuralq.doctor.exam.case.{name}", number)
         patch.setattr(values, "_NUM_STATES", 10)
         patch.setattr(network, "_FEW_WEIGHTS", 0)  # no kernels of fresh networks
-        patch.setattr(aliasing, "_MOST_ROWS", 2000)
+        patch.setattr(hidden, "_MOST_ROWS", 2000)
         yield
 
 

@@ -184,7 +184,7 @@ def test_bytes_become_brightness_and_flags_ones(layout: str, dtype: Any, brightn
 def test_bodies_have_names(name: str, kind: type) -> None:
     config = config_from_dict({"body": name})
     assert type(config.body) is kind and config.body == NAMED_BODIES[name]
-    with pytest.raises(ValueError, match="one of mlp, minatar, conv, or 'module:Class' of your own, got 'cnn'"):
+    with pytest.raises(ValueError, match="one of mlp, minatar, conv, gru, or 'module:Class' of your own, got 'cnn'"):
         config_from_dict({"body": "cnn"})
 
 

@@ -54,7 +54,7 @@ def test_a_configuration_comes_back_from_json_as_it_was(config: RunConfig) -> No
         ({"rollout": {"num_envs": "x"}}, "rollout.num_envs must be a whole number, got 'x'"),
         ({"rollout": [4]}, "rollout must be a mapping, got"),
         ({"rollout": {"lamda": 1}}, "rollout has unknown keys lamda; known are"),
-        ({"body": {"hidden": [8]}}, "class of the body must be one of 'MLP', 'Conv', 'Custom', got None"),
+        ({"body": {"hidden": [8]}}, "class of the body must be one of 'MLP', 'Conv', 'Custom', 'GRU', got None"),
         ({"body": {"class": "RNN"}}, "class of the body must be one of"),
         ({"body": {"class": "MLP", "depth": 2}}, "body has unknown keys depth"),
         ({"body": "MLP"}, "body must be a mapping with a class"),

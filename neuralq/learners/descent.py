@@ -42,10 +42,16 @@ class Descent:
         self._state = FlatOptimiser(optimiser, engine.flat.values)
         self.on_arrays = on_arrays(engine)
 
-    def fit(self, s: _Numbers, a: _Numbers, target: _Numbers, weight: _Numbers | None, scale: float = 1.0) -> _Numbers:
-        """One step on the weighted loss; returns the errors before it, ``[B]``; arrays where there is `on_arrays`."""
+    def fit(
+        self, s: _Numbers, a: _Numbers, target: _Numbers, weight: _Numbers | None, scale: float = 1.0,
+        last: Tensor | None = None,
+    ) -> _Numbers:  # fmt: skip
+        """One step on the weighted loss; returns the errors before it, ``[B]``; arrays where there is `on_arrays`.
+
+        With ``last``, where streams break, rows are the sequences ``[T, B]`` of a representation with a memory.
+        """
         if isinstance(target, Tensor):
-            errors = self.engine.loss_gradient(s, a, target, weight)
+            errors = self.engine.loss_gradient(s, a, target, weight, last)
         else:
             assert self.on_arrays is not None
             errors = self.on_arrays.loss_gradient_arrays(s, a, target, weight)

@@ -22,6 +22,7 @@ from neuralq.learners.descent import Descent, count_update
 from neuralq.learners.kind import LearnerKind, Parts, Traits
 from neuralq.learners.learner import Update
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.sequences import has_memory, recalled, stream_weights
 from neuralq.q.engine import Engine
 from neuralq.types import Array, Transition
 
@@ -139,6 +140,7 @@ class RolloutLearner:
         self.num_updates = 0
         self.total_updates = total_updates
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._has_memory = has_memory(engine)
         self._average: IterateAverage | None = None
         if settings.average_updates is not None:
             window = settings.average_updates * settings.num_epochs * settings.num_minibatches
@@ -150,11 +152,17 @@ class RolloutLearner:
 
     def targets(self, transition: Transition) -> Tensor:
         """λ-returns ``[T, N]`` under the present (or the target) values."""
-        q_t = self.engine.all(transition.s_t, target=self.settings.target_period_updates is not None)
+        target = self.settings.target_period_updates is not None
+        online = seen = transition
+        # The memories of a rollout are those of the parameters that collected it, as its values are.
+        if self._has_memory and (target or self.settings.refresh_targets):
+            online = recalled(self.engine, transition)
+            seen = recalled(self.engine, transition, target) if target else online
+        q_t = self.engine.all(seen.s_t, target)
         v_t = q_t.amax(-1)
         lambda_: Tensor | float = self.settings.lambda_
         if self.settings.returns == "watkins":
-            greedy = rules.is_greedy(self.engine.all(transition.s_tm1), transition.a_tm1)
+            greedy = rules.is_greedy(self.engine.all(online.s_tm1), transition.a_tm1)
             lambda_ = rules.watkins_lambda(self.settings.lambda_, greedy, v_t.dtype)
         r_t = transition.r_t.to(v_t.dtype) * self.reward_scale
         return rules.lambda_returns(r_t, transition.discount_t.to(v_t.dtype), v_t, lambda_, transition.last_t)
@@ -164,15 +172,13 @@ class RolloutLearner:
 
         The weights are looked through on the host; where they are on an accelerator it is waited for.
         """
+        if self._has_memory:
+            return self._update_sequences(transition, weight)
         targets = self.targets(transition).reshape(-1)
         rows = None if weight is None else weight.reshape(-1).nonzero()[:, 0].cpu().numpy()
         num_rows = len(targets) if rows is None else len(rows)
         errors = picked = targets
-        annealed = 1.0
-        if self.total_updates is not None:
-            before = int(self._num_steps) / len(targets)  # in rollouts
-            annealed = max(self.settings.anneal_to, 1.0 - before / self.total_updates)
-        self._num_steps += num_rows
+        annealed = self._annealed(len(targets), num_rows)
         for epoch in range(self.settings.num_epochs):
             if epoch > 0 and self.settings.refresh_targets:
                 targets = self.targets(transition).reshape(-1)
@@ -182,6 +188,40 @@ class RolloutLearner:
             errors, picked = self._fit(transition, targets, parts, annealed) if parts else (errors, picked)
         count_update(self, self.settings.target_period_updates)
         return Update(errors, picked)
+
+    def _annealed(self, room: int, num_rows: int) -> float:
+        """Factor of the learning rate; ``num_rows`` more steps have been learned from, and a rollout has ``room``."""
+        before = int(self._num_steps) / room  # in rollouts
+        self._num_steps += num_rows
+        return 1.0 if self.total_updates is None else max(self.settings.anneal_to, 1.0 - before / self.total_updates)
+
+    def _update_sequences(self, transition: Transition, weight: Tensor | None) -> Update:
+        """`update` where the representation has a memory: minibatches are of whole streams.
+
+        The gradient goes back through the memory to a rollout's first step, or that of an episode.
+        """
+        targets = self.targets(transition)
+        held = None if weight is None else weight.to(targets.device) > 0
+        annealed = self._annealed(targets.numel(), targets.numel() if held is None else int(held.sum()))
+        errors = picked = targets
+        for epoch in range(self.settings.num_epochs):
+            if epoch > 0 and self.settings.refresh_targets:
+                targets = self.targets(transition)
+            streams = np.array_split(self.rng.permutation(targets.shape[1]), self.settings.num_minibatches)
+            for part in filter(len, streams):
+                index = torch.from_numpy(part).to(targets.device)
+                step = transition.map(lambda x, index=index: x[:, index])
+                picked, taken = targets[:, index], None if held is None else held[:, index]
+                if taken is not None and not taken.any():
+                    continue
+                weights = None if taken is None else stream_weights(taken, targets.dtype)
+                errors = self._descent.fit(step.s_tm1, step.a_tm1, picked, weights, annealed, step.last_t)
+                if taken is not None:
+                    errors, picked = errors[taken], picked[taken]
+                if self._average is not None:
+                    self._average.update()
+        count_update(self, self.settings.target_period_updates)
+        return Update(errors.reshape(-1), picked.reshape(-1))
 
     def _fit(
         self, transition: Transition, targets: Tensor, parts: list[Array], annealed: float

@@ -6,7 +6,7 @@ moves along with the one it was meant for, and that is what decides whether trai
 """
 
 from neuralq.q.advice import Rule, insert_rules
-from neuralq.q.bodies import MLP, NAMED_BODIES, Conv, body_for
+from neuralq.q.bodies import MLP, Conv
 from neuralq.q.custom import BODIES, Body, Custom
 from neuralq.q.distributional import CategoricalQ, QuantileQ
 from neuralq.q.dueling import DuelingQ
@@ -14,10 +14,13 @@ from neuralq.q.flat import FlatParameters
 from neuralq.q.implicit import ImplicitQuantileQ
 from neuralq.q.layouts import ActionInputQ, ActionOutputQ, SeparateQ
 from neuralq.q.masked import MaskedQ
+from neuralq.q.named_bodies import NAMED_BODIES, body_for
+from neuralq.q.recurrent import GRU, RecurrentQ
 from neuralq.q.table_and_linear import LinearQ, TableQ
 
 __all__ = [
     "BODIES",
+    "GRU",
     "MLP",
     "NAMED_BODIES",
     "ActionInputQ",
@@ -32,6 +35,7 @@ __all__ = [
     "LinearQ",
     "MaskedQ",
     "QuantileQ",
+    "RecurrentQ",
     "Rule",
     "SeparateQ",
     "TableQ",

@@ -17,7 +17,7 @@ stored that way; `Conv` finds out, or is told, where the channels are, and turns
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -30,13 +30,11 @@ from neuralq.q.frames import channels_first
 __all__ = [
     "ACTIVATIONS",
     "MLP",
-    "NAMED_BODIES",
     "Conv",
     "GroupedConv",
     "GroupedLayerNorm",
     "GroupedLinear",
     "Trunk",
-    "body_for",
 ]
 
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh, "leaky_relu": nn.functional.leaky_relu, "sigmoid": torch.sigmoid}
@@ -325,36 +323,3 @@ class Conv:
     def trunk(self, fan_in: int, fan_out: int, copies: int, rng: np.random.Generator, dtype: torch.dtype) -> Trunk:
         """The dense layers of ``copies`` networks."""
         return Trunk(self, fan_in, fan_out, copies, rng, dtype)
-
-
-NAMED_BODIES: dict[str, MLP | Conv] = {
-    "mlp": MLP(),
-    # PQN (Gallici et al., 2024) for MinAtar, whose frames are [10, 10, C]; Seaquest's ten channels look like a side.
-    "minatar": Conv(init="he", channel_order="last"),
-    # The network of Mnih et al. (2015) for 84 × 84 frames, with PQN's layer normalisation.
-    "conv": Conv((32, 64, 64), (8, 4, 3), (4, 2, 1), (512,), init="he"),
-}
-"""Bodies by the names that configurations and the command line know them by."""
-
-
-def body_for(shape: tuple[int, ...], is_frame: bool) -> MLP | Conv:
-    """The body for observations where none is asked for.
-
-    Frames of at least 36 a side get the "conv" body, smaller ones "minatar", with the channel order found out; what is
-    too small for a kernel, or no frame at all, gets an `MLP`.
-
-    Args:
-        shape: of one observation.
-        is_frame: whether it is stored as bytes or flags; other arrays are frames where they have three axes, or four.
-
-    Example:
-        >>> body_for((84, 84, 4), True).kernel_sizes, body_for((10, 10), True).kernel_sizes
-        ((8, 4, 3), (3,))
-        >>> body_for((4,), False).hidden
-        (128, 128)
-    """
-    if len(shape) in (3, 4) or (len(shape) == 2 and is_frame):
-        sides = channels_first(shape)[1:]
-        if min(sides) >= 3:
-            return replace(NAMED_BODIES["conv" if min(sides) >= 36 else "minatar"], channel_order="auto")  # type: ignore[arg-type]
-    return MLP()

@@ -149,7 +149,9 @@ class MlpEngine:
             raise ValueError(f"actions must lie in 0..{self._num_actions - 1}, got {actions[wrong]}")
         return q
 
-    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    def loss_gradient(
+        self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None, last: Tensor | None = None
+    ) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
         check_samples(a, target, weight)
         self._check_legal(s, a, weight)

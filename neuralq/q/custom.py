@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from neuralq.checks import check_choice, check_whole
 from neuralq.q.bodies import ACTIVATIONS, MLP, Conv, Trunk
+from neuralq.q.recurrent import GRU
 
 __all__ = ["BODIES", "Body", "Custom", "CustomStem", "Example"]
 
@@ -78,7 +79,7 @@ class Custom:
         return MLP(self.hidden, self.layer_norm, self.activation).trunk(fan_in, fan_out, copies, rng, dtype)
 
 
-Body = MLP | Conv | Custom
+Body = MLP | Conv | Custom | GRU
 BODIES: dict[str, Any] = {kind.__name__: kind for kind in get_args(Body)}
 """By the name that configurations give them; a body of another kind is a class and its place in `Body`."""
 

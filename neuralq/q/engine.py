@@ -18,6 +18,7 @@ from neuralq import rules
 from neuralq.checks import check_choice, check_positive
 from neuralq.q.flat import FlatParameters
 from neuralq.q.masked import MaskedQ
+from neuralq.q.recurrent import recurrent_part
 from neuralq.types import QFunction
 
 __all__ = ["Engine", "Loss", "TorchEngine", "check_actions", "check_samples", "check_single", "follow", "no_target"]
@@ -51,8 +52,13 @@ class Engine(Protocol):
         """Action values ``[*n, A]`` without gradient; ``target`` asks the target copy."""
         ...
 
-    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    def loss_gradient(
+        self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None, last: Tensor | None = None
+    ) -> Tensor:
         """Errors target − Q(s, a) ``[*n]``; leaves the mean loss's gradient in ``flat.grad``.
+
+        With ``last``, where a stream breaks after a row, rows are sequences ``[T, B]`` and the gradient goes back
+        through what the representation remembers along them; for others it changes nothing.
 
         Raises:
             ValueError: if ``target`` or ``weight`` is not of the actions' shape, or an action does not exist, or is
@@ -92,6 +98,7 @@ class TorchEngine:
         self.q = q
         self.loss = loss
         self.flat = FlatParameters(cast(nn.Module, q))
+        self.recurrent = recurrent_part(q)
         self._target: QFunction | None = None
         self._target_flat: FlatParameters | None = None
 
@@ -101,11 +108,15 @@ class TorchEngine:
         # Acting comes with observations from the CPU, wherever the parameters live.
         return self.network(target).all(s.to(self.flat.values.device))
 
-    def loss_gradient(self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    def loss_gradient(
+        self, s: Tensor, a: Tensor, target: Tensor, weight: Tensor | None = None, last: Tensor | None = None
+    ) -> Tensor:
         """Errors and, in ``flat.grad``, the gradient of the mean weighted loss."""
         check_samples(a, target, weight)
         check_actions(a, self.q.num_actions)
         self.flat.grad.zero_()
+        if last is not None and self.recurrent is not None:
+            s, _ = self.recurrent.recalled(s, last)
         error = target.to(self.flat.values.dtype) - self._legal_at(s, a, weight)
         each = (
             rules.squared(error, weight) if self.loss.kind == "squared" else rules.huber(error, self.loss.delta, weight)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuralq.q.recurrent import recurrent_part
 from neuralq.runs.stream import Normalisation, ObservationSpec
 from neuralq.runs.stream.acting import choose_greedy
 from neuralq.runs.stream.encoding import Encoder
@@ -41,6 +42,10 @@ class Agent:
     """Acts greedily and tells what it expects, of one observation or of a batch.
 
     ``agent(observations)`` is `predict`.
+
+    An agent with a memory (`neuralq.q.GRU`) is given what it remembers, and says what it remembers next:
+    ``memory = agent.first_memory()`` where an episode begins, then ``action = agent.predict(observation,
+    memory=memory)`` and ``memory = agent.next_memory(observation, memory)`` at every step.
 
     Args:
         q: the representation.
@@ -79,7 +84,7 @@ class Agent:
         hint = f"; {_ELSEWHERE[name]}" if name in _ELSEWHERE else ""
         raise AttributeError(f"an agent has no {name!r}{hint}", name=name, obj=self)
 
-    def inputs(self, observations: Any, action_mask: Any = None) -> Array:
+    def inputs(self, observations: Any, action_mask: Any = None, memory: Any = None) -> Array:
         """What ``agent.q`` is given for observations, a row for each: ``[n, *spec.shape]``, one row for a single one.
 
         Arguments and errors as for `values`.
@@ -88,11 +93,51 @@ class Agent:
         encoded = self.encoder.encode_single(observations)[None] if single else self.encoder.encode(observations)
         if self.normalisation is not None:
             encoded = self.normalisation.observe(encoded)
+        flat = encoded.reshape(len(encoded), -1)
+        remembered = self._memory(memory, len(encoded), single)
+        if self.spec.memory_size:
+            encoded = flat = np.concatenate([flat, remembered], axis=1).astype(self.spec.dtype)
         if self.spec.masked:
             mask = self._mask(action_mask, len(encoded), single)
-            flat = np.concatenate([encoded.reshape(len(encoded), -1), mask], axis=1)
-            encoded = flat.astype(self.spec.dtype)
+            encoded = np.concatenate([flat, mask], axis=1).astype(self.spec.dtype)
         return encoded
+
+    def first_memory(self, num_rows: int | None = None) -> Array:
+        """What is remembered where episodes begin: ``[M]``, or ``[n, M]`` of n; M is 0 for agents without a memory."""
+        size = self.spec.memory_size
+        return np.zeros(size if num_rows is None else (num_rows, size), np.float32)
+
+    def next_memory(self, observations: Any, memory: Any) -> Array:
+        """What is remembered after observations were seen, in the shape of ``memory``.
+
+        Args:
+            observations: as for `values`.
+            memory: what was remembered before them.
+        """
+        recurrent = recurrent_part(self.q)
+        if recurrent is None:
+            return np.asarray(memory, np.float32)
+        rows = self.inputs(observations, None, memory)
+        with torch.no_grad():
+            after: Array = recurrent.next_memory(torch.from_numpy(rows).to(self._device)).cpu().numpy()
+        return after if self.encoder.is_batch(observations) else after[0]
+
+    def _memory(self, given: Any, num_rows: int, single: bool) -> Array:
+        size = self.spec.memory_size
+        if given is None and size:
+            raise ValueError(
+                "this agent has a memory and was not told what it remembers; begin an episode with memory = "
+                "agent.first_memory(), and after each step take memory = agent.next_memory(observation, memory)"
+            )
+        memory = np.zeros((num_rows, 0)) if given is None else np.asarray(given)
+        wanted = (size,) if single else (num_rows, size)
+        if given is not None and memory.shape != wanted:
+            raise ValueError(f"memory must be of shape {wanted}, as agent.first_memory gives it, got {memory.shape}")
+        return memory.reshape(num_rows, size)
+
+    @property
+    def _device(self) -> torch.device:
+        return next(iter(self.q.parameters())).device  # type: ignore[attr-defined,no-any-return]
 
     def _mask(self, given: Any, num_rows: int, single: bool) -> Array:
         """Which actions are legal, ``[n, A]``; one row may stand for all."""
@@ -103,12 +148,13 @@ class Agent:
             raise ValueError(f"action_mask must have {num_actions} entries{many}, got shape {mask.shape}")
         return np.broadcast_to(mask, (num_rows, num_actions))
 
-    def values(self, observations: Any, action_mask: Any = None) -> Array:
+    def values(self, observations: Any, action_mask: Any = None, memory: Any = None) -> Array:
         """Action values, in units of the environment's return.
 
         Args:
             observations: one, as the environment gives it; or n of them, as a vector environment gives them.
             action_mask: which actions are legal, ``[A]``, or ``[n, A]``; all of them where it is left out.
+            memory: of an agent that has one, ``[M]``, or ``[n, M]`` (`first_memory`, `next_memory`).
 
         Returns:
             ``[A]`` float64, or ``[n, A]``; −∞ for illegal actions.
@@ -116,15 +162,14 @@ class Agent:
         Raises:
             ValueError: if an observation or the mask is not what the environment's spaces promise.
         """
-        single, rows = not self.encoder.is_batch(observations), self.inputs(observations, action_mask)
-        device = next(iter(self.q.parameters())).device  # type: ignore[attr-defined]
+        single, rows = not self.encoder.is_batch(observations), self.inputs(observations, action_mask, memory)
         with torch.no_grad():
-            q = self.q.all(torch.from_numpy(rows).to(device))
+            q = self.q.all(torch.from_numpy(rows).to(self._device))
         values = q.cpu().numpy().astype(np.float64) / self.reward_scale
         values = np.where(self._mask(action_mask, len(rows), single), values, -np.inf)
         return values[0] if single else values
 
-    def predict(self, observations: Any, action_mask: Any = None, **elsewhere: Any) -> Any:
+    def predict(self, observations: Any, action_mask: Any = None, memory: Any = None, **elsewhere: Any) -> Any:
         """The greedy action, ready for ``env.step``: of one observation a whole number, of n ``[n]`` int64.
 
         It is always greedy, and comes alone; ``deterministic`` and the second result of other libraries there are not.
@@ -135,11 +180,11 @@ class Agent:
         """
         if elsewhere:
             raise TypeError(f"predict takes no {next(iter(elsewhere))}; {_ALONE}")
-        values = self.values(observations, action_mask)
+        values = self.values(observations, action_mask, memory)
         action, _ = choose_greedy(torch.from_numpy(values if values.ndim == 2 else values[None]))
         chosen = action.numpy() + self.first_action
         return chosen if values.ndim == 2 else _Action(chosen[0])
 
-    def __call__(self, observations: Any, action_mask: Any = None) -> Any:
+    def __call__(self, observations: Any, action_mask: Any = None, memory: Any = None) -> Any:
         """As `predict`."""
-        return self.predict(observations, action_mask)
+        return self.predict(observations, action_mask, memory)

@@ -83,6 +83,13 @@ class Beside:
         Raises:
             ValueError: the exact answer was asked for and cannot be given; says why.
         """
+        if asked and spec.memory_size:
+            raise ValueError(
+                "exact=True compares the values of states, and an agent with a memory values what it remembers; leave "
+                "exact out"
+            )
+        if spec.memory_size:
+            return None
         if asked is False or (asked is None and (spec.num_categories is None or _with_model(envs) is None)):
             return None
         return cls(envs, spec, gamma, asked)

@@ -40,8 +40,8 @@ from neuralq.runs.recipe.config import LEARNERS, RunConfig, config_from_dict, co
 from neuralq.runs.recipe.environments import make_envs, make_evaluation_envs
 from neuralq.runs.recipe.lookahead import warnings_ahead
 from neuralq.runs.recipe.opening import opening_lines
+from neuralq.runs.recipe.remembering import interaction, remembering
 from neuralq.runs.session import Session
-from neuralq.runs.stream import Interaction
 from neuralq.runs.stream.encoding import discrete_actions
 from neuralq.runs.warm_start import begun_from
 from neuralq.runs.watchers import monitor_verdict, watchers
@@ -197,7 +197,7 @@ def _load_agent(run_dir: str | Path, best: bool | None) -> Agent:
         if seen is not None:
             seen.load_state_dict(statistics)
             seen = seen.frozen()
-        stream = Interaction(envs, config.gamma, 0, config.layout == "table", seen)
+        stream = interaction(config, envs, 0, seen)
         stream.encoder.require_scalings(scalings)
         q = build_q(config, stream.spec, np.random.default_rng(0))
         FlatParameters(q).load(parameters)  # type: ignore[arg-type]
@@ -256,7 +256,7 @@ def evaluate_run(run_dir: str | Path, num_episodes: int = 100, seed: int = 0, be
     with limited_threads(config.threads):
         envs = make_evaluation_envs(config, min(num_episodes, 64))
         try:
-            stream = Interaction(envs, config.gamma, 0, config.layout == "table", agent.normalisation)
+            stream = remembering(interaction(config, envs, 0, agent.normalisation), agent.q)
             with torch.no_grad():
                 most = config.evaluation_max_steps or last_cap(run_dir)
                 found = evaluate_greedy(agent.q.all, stream, num_episodes, seed_for(seed, 7), most)

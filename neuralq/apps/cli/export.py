@@ -38,7 +38,7 @@ def export(argv: list[str]) -> int:
     path = single_run(options.run, options.trust)
     exported = export_run(path, out or f"network{FORMATS[to or 'torch']}", to, options.best)
     size = Path(exported.path).stat().st_size
-    plain = {**exported.plain(), exported.to: str(exported.path), "bytes": size, "outputs": ["values", "action"]}
+    plain = {**exported.plain(), exported.to: str(exported.path), "bytes": size}
     print_result(plain, options.json, _lines(exported, size))
     return 0
 
@@ -51,7 +51,8 @@ def _lines(exported: Exported, size: int) -> list[str]:
     shown = ", ".join(
         f"{one['name']} {one['dtype']} [{', '.join(map(str, one['shape']))}]" for one in exported.inputs or ()
     )
+    names = ", ".join(exported.outputs or ())
     return [
-        f"{exported.path}: {size:,} bytes; in: {shown}, as the environment gives it; out: values, action",
+        f"{exported.path}: {size:,} bytes; in: {shown}, as the environment gives it; out: {names}",
         difference,
     ]

@@ -77,16 +77,17 @@ def play(env: gym.Env[Any, Any], agent: Agent, num_episodes: int, seed: int, max
     for episode in range(1, num_episodes + 1):
         with _drawing("at reset"):
             observation, info = env.reset(seed=seed_for(seed, 10, episode))
-        total, over = 0.0, False
+        total, over, memory = 0.0, False, agent.first_memory()
         for step in range(max_steps + 1):
             with _drawing("asked for its legal actions"):
                 mask = None if over else legal_actions(env, info)
-            value = math.nan if over else float(np.max(agent.values(observation, mask)))
+            value = math.nan if over else float(np.max(agent.values(observation, mask, memory)))
             over = over or step == max_steps
             yield Moment(episode, step, total, value, over)
             if over:
                 break
-            action = agent.predict(observation, mask)
+            action = agent.predict(observation, mask, memory)
+            memory = agent.next_memory(observation, memory)
             with _drawing(f"in step {step + 1} of episode {episode}"):
                 observation, reward, terminated, truncated, info = env.step(action)
                 total += float(reward)

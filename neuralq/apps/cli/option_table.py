@@ -12,7 +12,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from neuralq.apps.cli import DEBUG
 from neuralq.apps.cli.option_values import ENV_KWARGS, reader
-from neuralq.q.bodies import NAMED_BODIES
+from neuralq.q.named_bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.config import LAYOUTS, LEARNERS
 from neuralq.runs.recipe.replay_presets import AGENTS

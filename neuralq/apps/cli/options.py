@@ -15,7 +15,7 @@ from neuralq.apps.cli import Failure
 from neuralq.apps.cli.option_table import TrainOptions, train_parser
 from neuralq.apps.cli.option_values import as_typed, hyphenated, read_config_file, read_options
 from neuralq.apps.cli.yaml_text import write_yaml
-from neuralq.q.bodies import NAMED_BODIES
+from neuralq.q.named_bodies import NAMED_BODIES
 from neuralq.runs import RunConfig
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, body_to_dict, config_from_dict, config_to_dict, layout_for

@@ -44,6 +44,11 @@ def of_agent(agent: Agent) -> Subject:
     Raises:
         CannotLoad: there are action masks, and they are not around its values but inside.
     """
+    if agent.spec.memory_size:
+        raise CannotLoad(
+            "this agent remembers, and the doctor examines functions of the present observation; neuralq report shows "
+            "how its run went"
+        )
     network = agent.q.inner if isinstance(agent.q, MaskedQ) else agent.q
     if agent.spec.masked and network is agent.q:
         raise CannotLoad(f"a {type(agent.q).__name__} with action masks inside it is not taken apart")

@@ -18,6 +18,7 @@ from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.learners.replay.targets import q_learning_array_targets, q_learning_targets
+from neuralq.learners.sequences import after_burn_in, has_memory, recalled
 from neuralq.q.engine import Engine
 from neuralq.rules import Seen
 from neuralq.rules.one_step import Q_LEARNING
@@ -61,6 +62,7 @@ class ReplayLearner:
         self.num_updates = 0
         self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
         self._average = average_for(engine, settings)
+        self._has_memory = has_memory(engine)
         self._parts = {"descent": self._descent, "average": self._average}
         self._options = settings.options
         self._is_plain = settings.rule is Q_LEARNING
@@ -80,6 +82,8 @@ class ReplayLearner:
 
     def update(self, transition: Transition, weight: Tensor | None = None) -> Update:
         """One descent step on a batch; ``weight``, shaped like ``r_t``, multiplies each sample's loss."""
+        if self._has_memory:
+            return self._update_sequences(transition, weight)
         arrays = self._arrays_of(transition)
         if arrays is not None:
             return self._update_arrays(arrays, None if weight is None else weight.to(transition.r_t.dtype).numpy())
@@ -96,6 +100,22 @@ class ReplayLearner:
             errors = self._descent.fit(s, a, targets, weight)
         finish_update(self)
         return Update(errors, targets)
+
+    def _update_sequences(self, transition: Transition, weight: Tensor | None) -> Update:
+        """`update` by blocks ``[T, B]`` where the representation has a memory, after rows that bring it along.
+
+        Values and targets each go by the memories that their own parameters have.
+        """
+        if transition.r_t.dim() != 2:
+            raise ValueError(f"a memory is learned from blocks [T, B], got rows {tuple(transition.r_t.shape)}")
+        burn_in = self.settings.burn_in
+        frozen = recalled(self.engine, transition, target=True)
+        targets = self.targets(frozen.map(lambda x: x[burn_in:]))
+        step = after_burn_in(self.engine, transition, burn_in)
+        weight = None if weight is None else weight[burn_in:].to(targets.device)
+        errors = self._descent.fit(step.s_tm1, step.a_tm1, targets, weight, last=step.last_t)
+        finish_update(self)
+        return Update(errors.reshape(-1), targets.reshape(-1))
 
     def _arrays_of(self, transition: Transition) -> tuple[Array, ...] | None:
         """Observation, action, reward, discount and successor as arrays, where the quick way applies.

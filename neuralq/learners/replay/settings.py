@@ -57,6 +57,7 @@ class ReplaySettings:
         target_rule: SAMPLES; with block_length > 1 BLOCKS.
         num_steps: n of n-step targets.
         block_length: rows of a contiguous block for λ-returns; 1 for independent samples.
+        burn_in: rows before each block that are not learned from and bring the memory of a "gru" body along.
         lambda_: λ of the λ-returns.
         num_envs: parallel environments.
         capacity: transitions stored.
@@ -93,6 +94,7 @@ class ReplaySettings:
     target_rule: str = "q_learning"
     num_steps: int = 1
     block_length: int = 1
+    burn_in: int = 0
     lambda_: float = 0.8
     num_envs: int = 1
     capacity: int = 50_000
@@ -126,6 +128,7 @@ class ReplaySettings:
         counts = ("num_steps", "block_length", "num_envs", "capacity", "batch_size", "train_period")
         for name in (*counts, "learning_starts", "updates_per_period"):
             check_whole(name, getattr(self, name))
+        check_whole("burn_in", self.burn_in, 0)
         check_fraction("lambda_", self.lambda_, "for Monte Carlo use lambda_=1")
         check_positive("learning_rate", self.learning_rate)
         if self.max_grad_norm is not None:
@@ -223,6 +226,8 @@ def _check_blocks(settings: ReplaySettings) -> None:
             f"({named}) need blocks of at least 2 rows, the other rules take single samples"
         )
     if not blocks:
+        if settings.burn_in:
+            raise ValueError(f"burn_in={settings.burn_in} goes before blocks, and there are none; leave it out")
         return
     if settings.num_steps > 1 or settings.prioritised:
         raise ValueError(
@@ -230,12 +235,12 @@ def _check_blocks(settings: ReplaySettings) -> None:
         )
     if settings.batch_size < settings.block_length:
         raise ValueError(f"batch_size={settings.batch_size} holds no block of block_length={settings.block_length}")
-    least = settings.block_length * settings.num_envs
+    least = (settings.burn_in + settings.block_length) * settings.num_envs
     for name in ("learning_starts", "capacity"):
         if getattr(settings, name) < least:
             raise ValueError(
                 f"{name}={getattr(settings, name)} steps over {settings.num_envs} environment(s) hold no block of "
-                f"block_length={settings.block_length}; take at least {least}"
+                f"{settings.burn_in + settings.block_length} rows; take at least {least}"
             )
 
 

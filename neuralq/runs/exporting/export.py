@@ -9,7 +9,7 @@ from typing import Any
 
 from neuralq.checks import check_choice
 from neuralq.runs.api import environment_of, folder_of, load
-from neuralq.runs.exporting.network import raw_inputs
+from neuralq.runs.exporting.network import output_names, raw_inputs
 from neuralq.runs.exporting.onnx_file import described, write_onnx
 from neuralq.runs.exporting.played import played
 from neuralq.runs.exporting.torch_file import write_torch
@@ -34,6 +34,7 @@ class Exported:
         num_observations: of random play, on which it was checked.
         python: lines that load it, without neuralq; of a torch file.
         inputs: name, dtype and shape of each input; of an ONNX file.
+        outputs: their names; of an ONNX file.
         allowed: largest difference that would have been allowed; of an ONNX file.
     """
 
@@ -45,6 +46,7 @@ class Exported:
     python: str | None = None
     inputs: list[dict[str, Any]] | None = None
     allowed: float | None = None
+    outputs: list[str] | None = None
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
@@ -91,5 +93,7 @@ def export(run: Any, path: str | Path, to: str | None = None, best: bool | None 
         python, difference = write_torch(agent, config, out, seen)
         return Exported(out, to, folder, difference, len(seen.values), python=python)
     difference, allowed = write_onnx(agent, config, out, seen)
-    inputs = described(agent, raw_inputs(agent, seen.observations, seen.masks))
-    return Exported(out, to, folder, difference, len(seen.values), inputs=inputs, allowed=allowed)
+    inputs = described(agent, raw_inputs(agent, seen.observations, seen.masks, seen.memories))
+    return Exported(
+        out, to, folder, difference, len(seen.values), inputs=inputs, allowed=allowed, outputs=output_names(agent)
+    )

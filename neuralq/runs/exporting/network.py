@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuralq.q.recurrent import recurrent_part
 from neuralq.runs.agent import Agent
 from neuralq.runs.stream.encoding import Part
 from neuralq.runs.stream.normalisation import CLIP
 from neuralq.types import Array
 
-__all__ = ["ExportedNetwork", "input_names", "raw_inputs"]
+__all__ = ["ExportedNetwork", "input_names", "output_names", "raw_inputs"]
 
 
 def input_names(agent: Agent) -> list[str]:
@@ -28,17 +29,24 @@ def input_names(agent: Agent) -> list[str]:
         >>> from gymnasium import spaces
         >>> from neuralq.runs.stream.encoding import encoder_for
         >>> space = spaces.Dict({"arm": spaces.Tuple([spaces.Box(-1, 1, (2,))]), "gear": spaces.Discrete(3)})
-        >>> spec = type("Spec", (), {"masked": True})
+        >>> spec = type("Spec", (), {"masked": True, "memory_size": 0})
         >>> input_names(Agent(None, encoder_for(space), spec))
         ['arm.0', 'gear', 'action_mask']
     """
     names = [".".join(map(str, part.keys)) or "observation" for part in agent.encoder.parts]
     if agent.spec.masked:
         names.append("action_mask" if "action_mask" not in names else "legal_actions")
+    if agent.spec.memory_size:
+        names.append("memory" if "memory" not in names else "remembered")
     return names
 
 
-def raw_inputs(agent: Agent, observations: Sequence[Any], masks: Sequence[Any]) -> list[Array]:
+def output_names(agent: Agent) -> list[str]:
+    """Values and the greedy action, and what an agent with a memory remembers next."""
+    return ["values", "action", *(["next_memory"] if agent.spec.memory_size else [])]
+
+
+def raw_inputs(agent: Agent, observations: Sequence[Any], masks: Sequence[Any], memories: Array) -> list[Array]:
     """Observations as an environment gave them, one array ``[n, …]`` for each of `input_names`."""
     inputs = [
         np.stack([np.asarray(part.find(one) if part.keys else one) for one in observations]).astype(part.dtype)
@@ -47,11 +55,16 @@ def raw_inputs(agent: Agent, observations: Sequence[Any], masks: Sequence[Any]) 
     if agent.spec.masked:
         everything = np.ones(agent.spec.num_actions)
         inputs.append(np.stack([everything if one is None else np.asarray(one) for one in masks]) != 0)
+    if agent.spec.memory_size:
+        inputs.append(memories)
     return inputs
 
 
 class ExportedNetwork(nn.Module):
-    """Inputs as `raw_inputs` gives them to action values ``[n, A]`` in the environment's units, and greedy actions."""
+    """Inputs as `raw_inputs` gives them to action values ``[n, A]`` in the environment's units, and greedy actions.
+
+    One step of an agent with a memory, which is the last of the inputs and, as it is afterwards, of the outputs.
+    """
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
@@ -60,7 +73,7 @@ class ExportedNetwork(nn.Module):
         self.first_action = agent.first_action
         self.encoder = agent.encoder
         self.dtype = torch.from_numpy(np.zeros((), agent.spec.dtype)).dtype
-        self.masked = agent.spec.masked
+        self.masked, self.has_memory = agent.spec.masked, agent.spec.memory_size > 0
         scaling = None if agent.normalisation is None else agent.normalisation.scaling()
         self.is_normalised = scaling is not None
         if scaling is not None:
@@ -68,17 +81,21 @@ class ExportedNetwork(nn.Module):
             self.register_buffer("mean", torch.as_tensor(mean))
             self.register_buffer("inverse", torch.as_tensor(inverse))
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Values and greedy actions of a batch."""
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Values and greedy actions of a batch, and the memories afterwards."""
         parts = self.encoder.parts
         s = self._encoded(inputs[: len(parts)])
         if self.is_normalised:
             flat = (s.flatten(1).double() - self.get_buffer("mean")) * self.get_buffer("inverse")
             s = flat.clamp(-CLIP, CLIP).float().reshape(s.shape)
-        if self.masked:
-            s = torch.cat([s.reshape(s.shape[0], -1).to(self.dtype), inputs[-1].to(self.dtype)], 1)
+        beside = [inputs[-1]] if self.has_memory else []
+        beside += [inputs[len(parts)]] if self.masked else []
+        if beside:
+            s = torch.cat([one.reshape(one.shape[0], -1).to(self.dtype) for one in (s, *beside)], 1)
         values = self.q.all(s) / self.scale
-        return values, values.argmax(-1) + self.first_action
+        found = values, values.argmax(-1) + self.first_action
+        recurrent = recurrent_part(self.q)
+        return found if recurrent is None else (*found, recurrent.next_memory(s))
 
     def _encoded(self, inputs: Sequence[Tensor]) -> Tensor:
         layout, parts = self.encoder.layout, self.encoder.parts

@@ -15,7 +15,7 @@ import torch
 from neuralq.checks import MissingExtra
 from neuralq.runs import RunConfig
 from neuralq.runs.agent import Agent
-from neuralq.runs.exporting.network import ExportedNetwork, input_names, raw_inputs
+from neuralq.runs.exporting.network import ExportedNetwork, input_names, output_names, raw_inputs
 from neuralq.runs.exporting.played import Played
 from neuralq.runs.folder.files import replacing
 from neuralq.types import Array
@@ -41,10 +41,10 @@ def write_onnx(agent: Agent, config: RunConfig, out: Path, played: Played) -> tu
         MissingExtra: if the package that writes or the one that runs such files is not installed.
         ValueError: if the values differ by more; then there is no file.
     """
-    inputs = raw_inputs(agent, played.observations, played.masks)
+    inputs = raw_inputs(agent, played.observations, played.masks, played.memories)
     with replacing(out) as partial:
         _write(agent, inputs, partial, config)
-        difference, bound = _difference(partial, inputs, played.values, agent)
+        difference, bound = _difference(partial, inputs, played, agent)
         if not difference <= bound:
             raise ValueError(
                 f"the exported network differs from the run's by {difference:.2g}, and {bound:.2g} is allowed; "
@@ -60,7 +60,7 @@ def _write(agent: Agent, inputs: Sequence[Array], path: Path, config: RunConfig)
         raise MissingExtra(f'ONNX is not installed ({error}); install it with: pip install "neuralq[onnx]"') from error
     network = ExportedNetwork(agent).cpu().eval()
     given = input_names(agent)
-    names = [*given, "values", "action"]
+    names = [*given, *output_names(agent)]
     with warnings.catch_warnings():
         # The exporter that traces: it needs the package onnx alone. What it warns of (values read while tracing) is
         # what the comparison afterwards, with other batch sizes, would show.
@@ -86,7 +86,7 @@ def _write(agent: Agent, inputs: Sequence[Array], path: Path, config: RunConfig)
     onnx.save(model, str(path))
 
 
-def _difference(path: Path, inputs: Sequence[Array], expected: Array, agent: Agent) -> tuple[float, float]:
+def _difference(path: Path, inputs: Sequence[Array], played: Played, agent: Agent) -> tuple[float, float]:
     """Largest difference of values, ∞ where illegal or greedy actions differ, and what float32 is allowed.
 
     Values of some hundreds are known to float32 no better than 1e-5, so the bound is relative above 1.
@@ -99,8 +99,11 @@ def _difference(path: Path, inputs: Sequence[Array], expected: Array, agent: Age
         ) from error
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     names = input_names(agent)
-    found, actions = session.run(None, dict(zip(names, inputs, strict=True)))
-    alone, _ = session.run(None, {name: x[:1] for name, x in zip(names, inputs, strict=True)})
+    found, actions, *after = session.run(None, dict(zip(names, inputs, strict=True)))
+    alone, *_ = session.run(None, {name: x[:1] for name, x in zip(names, inputs, strict=True)})
+    expected = played.values
+    if after and not _goes_on(after[0], played.memories):
+        return np.inf, _TOLERANCE
     found = np.concatenate([found, alone]).astype(np.float64)
     expected = np.concatenate([expected, expected[:1]])
     finite = np.isfinite(expected)
@@ -111,3 +114,9 @@ def _difference(path: Path, inputs: Sequence[Array], expected: Array, agent: Age
     if np.any(expected[:-1].max(-1) - chosen > 2 * bound):  # ties may fall either way within the bound
         return np.inf, bound
     return float(np.max(np.abs(found[finite] - expected[finite]))), bound
+
+
+def _goes_on(after: Array, memories: Array) -> bool:
+    """Whether the memories after each step are those before the next, where it is not an episode's first."""
+    within = np.flatnonzero(memories[1:].any(-1))
+    return bool(np.allclose(after[:-1][within], memories[1:][within], rtol=0, atol=_TOLERANCE))

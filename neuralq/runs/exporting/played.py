@@ -28,12 +28,14 @@ class Played:
         observations: as the environment gave them.
         masks: of legal actions, None where it gave none.
         space: of the observations.
+        memories: what the agent remembers before each, ``[n, M]``.
         values: the agent's ``[n, A]``, in units of the environment's return.
     """
 
     observations: list[Any]
     masks: list[Any]
     space: gym.Space[Any]
+    memories: Array
     values: Array
 
 
@@ -46,6 +48,7 @@ def played(config: RunConfig, agent: Agent) -> Played:
     env = make_one(config)
     rng = np.random.default_rng(0)
     observations, masks, values = list[Any](), list[Any](), []
+    memories, memory = [], agent.first_memory()
     try:
         with faults_of("at reset"):
             observation, info = env.reset(seed=0)
@@ -53,13 +56,16 @@ def played(config: RunConfig, agent: Agent) -> Played:
             mask = legal_actions(env, info)
             observations.append(copy.deepcopy(observation))  # environments may reuse theirs
             masks.append(copy.deepcopy(mask))
-            values.append(agent.values(observation, mask))
+            memories.append(memory)
+            values.append(agent.values(observation, mask, memory))
+            memory = agent.next_memory(observation, memory)
             legal = np.flatnonzero(np.isfinite(values[-1]))
             action = int(rng.choice(legal)) + agent.first_action
             with faults_of("in a step of random play"):
                 observation, _, terminated, truncated, info = env.step(action)
                 if terminated or truncated:
                     observation, info = env.reset()
+                    memory = agent.first_memory()
     finally:
         env.close()
-    return Played(observations, masks, env.observation_space, np.stack(values))
+    return Played(observations, masks, env.observation_space, np.stack(memories), np.stack(values))

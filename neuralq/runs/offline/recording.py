@@ -47,8 +47,10 @@ def record_steps(
             observation, info = env.reset(seed=seed_for(seed, 10, episode))
         if legal_actions(env, info) is not None:
             raise ValueError("a data set says nothing of illegal actions, and this environment masks some")
+        memory = agent.first_memory()
         for step in range(1, max_steps + 1):
-            q = np.asarray(agent.values(observation))[None]
+            q = np.asarray(agent.values(observation, memory=memory))[None]
+            memory = agent.next_memory(observation, memory)
             action, mu = choose_among(q, epsilon, rng.random(1))
             before = np.array(observation)
             with faults_of(f"in step {step} of episode {episode + 1}"):

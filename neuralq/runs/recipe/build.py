@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -24,6 +25,7 @@ from neuralq.q import (
     DuelingQ,
     LinearQ,
     MaskedQ,
+    RecurrentQ,
     Rule,
     SeparateQ,
     TableQ,
@@ -43,6 +45,7 @@ from neuralq.runs.offline.playback import OFFLINE, OfflineExperience, Playback, 
 from neuralq.runs.recipe.config import RunConfig
 from neuralq.runs.recipe.environments import has_time_limit, make_envs, make_evaluation_envs, make_one
 from neuralq.runs.recipe.lookahead import require_room
+from neuralq.runs.recipe.remembering import interaction, remembering
 from neuralq.runs.session import Session
 from neuralq.runs.stream import Interaction, Normalisation, ObservationSpec, make_vector_env
 from neuralq.runs.stream.acting import EpsilonGreedyPolicy, choose_greedy
@@ -85,7 +88,7 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
     num_outputs = spec.num_actions * per_action
     if num_categories is not None and config.layout != "table":
         features, shape = OneHot(num_categories), (num_categories,)
-    elif spec.dtype == np.uint8:
+    elif (spec.inner_dtype or spec.dtype) == np.uint8:
         scaling = spec.frame_scaling
         features = Pixels(1.0) if scaling is None else Pixels(scaling.divisor, scaling.origin)
     if config.layout == "table":
@@ -100,14 +103,21 @@ def build_q(config: RunConfig, spec: ObservationSpec, rng: np.random.Generator) 
         q = LinearQ(int(np.prod(shape)), num_outputs, bias=num_categories is None, features=flat)
     else:
         body = config.body or body_for(shape, is_frame=spec.dtype.kind in "bu")
+        within = None if spec.memory_size else features
+        shape = (math.prod(shape) + spec.memory_size,) if spec.memory_size else shape
         if config.dueling:
-            q = DuelingQ(shape, spec.num_actions, body, features, rng, num_atoms=per_action)
+            q = DuelingQ(shape, spec.num_actions, body, within, rng, num_atoms=per_action)
         else:
-            q = _NETWORKS[config.layout](shape, num_outputs, body, features, rng)
+            q = _NETWORKS[config.layout](shape, num_outputs, body, within, rng)
+    if spec.memory_size:
+        assert spec.inner_dtype is not None
+        dtype = None if features is None else torch.from_numpy(np.zeros((), spec.inner_dtype)).dtype
+        q = RecurrentQ(q, spec.inner_shape, features, dtype)
     q = config.kind.represent(q, config.settings, config.reward_scale, rng)
     if config.rules:
         q = insert_rules(q, cast("tuple[Rule, ...]", config.rules))
-    return MaskedQ(q, spec.inner_shape) if spec.masked else q
+    inner_shape = (math.prod(spec.inner_shape) + spec.memory_size,) if spec.memory_size else spec.inner_shape
+    return MaskedQ(q, inner_shape) if spec.masked else q
 
 
 def normalisation_for(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Normalisation | None:
@@ -155,12 +165,12 @@ def build_session(config: RunConfig) -> Session:
 
 def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     settings = config.settings
-    as_index = config.layout == "table"
     normalisation = normalisation_for(config, envs)
-    stream = Interaction(envs, config.gamma, seed_for(config.seed, 0), as_index, normalisation)
+    stream = interaction(config, envs, seed_for(config.seed, 0), normalisation)
     generators = {name: np.random.default_rng(seed_for(config.seed, i)) for i, name in ((1, "policy"), (2, "samples"))}
     require_room(config, stream.spec)
     engine = make_engine(_q_on_device(config, stream.spec, 3), config.kind.loss(settings), config.engine)
+    remembering(stream, engine.q)
     learner = _learner(config, engine, stream.spec, generators["samples"])
     experience = _SOURCES[config.kind.experience](settings, stream.spec, generators["samples"])
     epsilon = Linear(config.epsilon_start, config.epsilon_end, config.epsilon_decay_steps)
@@ -175,7 +185,7 @@ def _session(config: RunConfig, envs: VectorEnv[Any, Any, Any]) -> Session:
     _warm(config, engine, stream)
     cap = MOST_STEPS if config.evaluation_max_steps is None and has_time_limit(envs) else config.evaluation_max_steps
     return Session(
-        stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen), probe,
+        stream, policy, experience, learner, generators, lambda: _evaluation(config, frozen, engine.q), probe,
         config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
         _value_range(config.settings), Beside.of(envs, stream.spec, config.gamma, config.exact),
     )  # fmt: skip
@@ -221,7 +231,7 @@ def _walking_session(config: RunConfig) -> Session:
         stream.begin(learner)
         cap = MOST_STEPS if config.evaluation_max_steps is None and stream.time_limit else config.evaluation_max_steps
         return Session(
-            stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None),
+            stream, None, None, learner, {"samples": rng}, lambda: _evaluation(config, None, engine.q),
             SIMULATED if stream.simulated else _probe(config, envs, lambda: make_one(config)),
             config.seed, config.evaluation_episodes, cap, config.evaluate_every, config.reward_scale,
             beside=_beside_a_walk(config, envs, stream),
@@ -242,10 +252,10 @@ def _beside_a_walk(config: RunConfig, env: gym.Env[Any, Any], stream: TableWalk)
     return None
 
 
-def _evaluation(config: RunConfig, frozen: Normalisation | None) -> Interaction:
+def _evaluation(config: RunConfig, frozen: Normalisation | None, q: QFunction) -> Interaction:
     envs = make_evaluation_envs(config, config.evaluation_episodes)
     try:
-        return Interaction(envs, config.gamma, seed_for(config.seed, 4), config.layout == "table", frozen)
+        return remembering(interaction(config, envs, seed_for(config.seed, 4), frozen), q)
     except BaseException:
         envs.close()
         raise
@@ -312,15 +322,15 @@ def _rollouts(settings: Any, spec: ObservationSpec, rng: np.random.Generator) ->
 
 def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> ExperienceSource:
     buffer = _buffer(settings, spec, settings.capacity)
-    if settings.block_length > max(1, buffer.least_steps):
+    if settings.burn_in + settings.block_length > max(1, buffer.least_steps):
         raise ValueError(
             f"capacity={settings.capacity} may hold no block of block_length={settings.block_length}: observations of "
             "this size are stored once where streams go on, and short episodes take twice the room; take at least "
-            f"{2 * settings.block_length * settings.num_envs}"
+            f"{2 * (settings.burn_in + settings.block_length) * settings.num_envs}"
         )
     return ReplayExperience(
         buffer, rng, settings.batch_size, settings.block_length,
-        settings.learning_starts, settings.train_period, settings.updates_per_period,
+        settings.learning_starts, settings.train_period, settings.updates_per_period, settings.burn_in,
     )  # fmt: skip
 
 
@@ -353,7 +363,8 @@ def _warm(config: RunConfig, engine: Engine, stream: Interaction) -> None:
     if isinstance(learner, HasValues):
         learner.values(step.s_tm1)
     time_major = experience == "rollouts" or getattr(settings, "block_length", 1) > 1
-    learner.update(step.map(lambda x: x[None]) if time_major else step)
+    rows = 1 + getattr(settings, "burn_in", 0)
+    learner.update(step.map(lambda x: torch.stack([x] * rows)) if time_major else step)
     if experience == "replay":
         _warm_buffer(_buffer(settings, stream.spec, 8 * settings.num_envs), stream, settings)
     if stream.normalisation is not None:

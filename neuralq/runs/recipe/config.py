@@ -13,8 +13,9 @@ import numpy as np
 
 from neuralq.checks import MOST_WHOLE, check_choice, check_discount, check_fraction, check_positive, check_whole
 from neuralq.learners.kind import LearnerKind, learner_kinds
-from neuralq.q import BODIES, MLP, NAMED_BODIES, Body, Custom, Rule
+from neuralq.q import BODIES, GRU, MLP, NAMED_BODIES, Body, Custom, Rule
 from neuralq.runs.recipe.games import is_screen
+from neuralq.runs.recipe.remembering import check_memory
 from neuralq.runs.recipe.wrapping import check_wrappers
 
 __all__ = [
@@ -90,8 +91,8 @@ class RunConfig:
         epsilon_start: exploration at the first step.
         epsilon_end: exploration after ``epsilon_decay_steps``, reached linearly.
         epsilon_decay_steps: environment steps.
-        body: network body, MLP, Conv or Custom (a module of your own); networks only. None picks MLP, or Conv for
-            images.
+        body: network body, MLP, Conv, GRU (which remembers) or Custom (a module of your own); networks only. None picks
+            MLP, or Conv for images.
         rules: advice that begins as units of the network, one in each hidden layer for a rule, beside those of the body
             (`neuralq.q.Rule`, or a mapping of its fields); three layouts with an MLP, without layer normalisation.
         dueling: whether a value and an advantage stream make the outputs (Wang et al., 2016); action-output only.
@@ -224,6 +225,7 @@ def _check_body(config: RunConfig) -> None:
     if config.body is not None and config.layout not in NETWORKS:
         what = "table" if config.layout == "table" else "linear function"
         raise ValueError(f"a {what} has no network body; leave body out or choose one of {', '.join(NETWORKS)}")
+    check_memory(config)
     if config.rules and config.layout not in NETWORKS:
         what = "table" if config.layout == "table" else "linear function"
         raise ValueError(
@@ -264,7 +266,7 @@ def _check_outputs(config: RunConfig) -> None:
         raise ValueError(f"dueling needs layout='action-output', got {config.layout!r}: {why}")
     if config.dueling and config.body is not None and not config.body.hidden:
         raise ValueError("dueling streams need a hidden layer, got a body with hidden=(); give it a width")
-    if config.layout == "action-input" and isinstance(config.body, Custom) and not config.body.hidden:
+    if config.layout == "action-input" and isinstance(config.body, Custom | GRU) and not config.body.hidden:
         raise ValueError(
             "without a layer after it the action would be added to what the body says of the state, and one action be "
             "best everywhere; give the body hidden=(width,), or use another layout"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from neuralq.checks import check_choice
-from neuralq.q.bodies import NAMED_BODIES
+from neuralq.q.named_bodies import NAMED_BODIES
 from neuralq.rules.target_rule import target_rules
 from neuralq.runs.recipe.budget import cut_to_budget
 from neuralq.runs.recipe.config import LEARNERS, NETWORKS, RunConfig, body_to_dict, config_from_dict, layout_for

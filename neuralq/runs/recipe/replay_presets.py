@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from neuralq.checks import check_choice
-from neuralq.q.bodies import NAMED_BODIES
+from neuralq.q.named_bodies import NAMED_BODIES
 from neuralq.runs.recipe.config import body_to_dict
 from neuralq.runs.recipe.games import ATARI
 

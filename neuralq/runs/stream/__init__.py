@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from neuralq.runs.stream.faults import EnvironmentFault, faults_of
 from neuralq.runs.stream.normalisation import Normalisation
-from neuralq.runs.stream.stream import Episode, Interaction, ObservationSpec, Policy, Step, interact
+from neuralq.runs.stream.spec import ObservationSpec
+from neuralq.runs.stream.stream import Episode, Interaction, Policy, Step, interact
 from neuralq.runs.stream.vector_env import MASK_METHODS, SubEnv, SubEnvFault, legal_actions, make_vector_env
 
 __all__ = [

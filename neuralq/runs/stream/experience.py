@@ -148,10 +148,11 @@ class ReplayExperience:
         buffer: where steps are stored.
         rng: draws the samples.
         batch_size: rows per sample; with blocks, ``batch_size // block_length`` blocks.
-        block_length: 1 for independent samples ``[B]``, more for blocks ``[T, B]``.
+        block_length: 1 for independent samples ``[B]``, more for blocks ``[burn_in + block_length, B]``.
         learning_starts: steps stored before the first sample.
         train_period: environment steps between samples.
         updates_per_period: samples at each of those times.
+        burn_in: rows of a block before those that are learned from.
     """
 
     buffer: ReplayBuffer
@@ -161,6 +162,7 @@ class ReplayExperience:
     learning_starts: int
     train_period: int
     updates_per_period: int
+    burn_in: int = 0
 
     def __post_init__(self) -> None:
         """Nothing is stored yet."""
@@ -187,7 +189,8 @@ class ReplayExperience:
             for _ in range(self.updates_per_period):
                 if self.block_length > 1:
                     blocks = self.batch_size // self.block_length
-                    yield Sample(self.buffer.sample_blocks(blocks, self.block_length, self.rng))
+                    length = self.burn_in + self.block_length
+                    yield Sample(self.buffer.sample_blocks(blocks, length, self.rng))
                     continue
                 batch = self.buffer.sample(self.batch_size, self.rng)
                 if self.buffer.prioritised is None:

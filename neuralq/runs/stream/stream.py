@@ -15,11 +15,11 @@ from neuralq.checks import check_discount
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
 from neuralq.runs.stream.faults import EnvironmentFault, describe_error
 from neuralq.runs.stream.normalisation import Normalisation
-from neuralq.runs.stream.scaling import Scaling
+from neuralq.runs.stream.spec import ObservationSpec
 from neuralq.runs.stream.vector_env import SubEnv, as_number
 from neuralq.types import Array, Transition
 
-__all__ = ["Episode", "Interaction", "ObservationSpec", "Policy", "Step", "interact"]
+__all__ = ["Episode", "Interaction", "Policy", "Step", "interact"]
 
 
 class Policy(Protocol):
@@ -32,29 +32,6 @@ class Policy(Protocol):
     def __call__(self, s: Tensor, /) -> tuple[Tensor, Tensor]:
         """Actions and their probabilities."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class ObservationSpec:
-    """What a representation is handed.
-
-    Args:
-        shape: of one encoded observation, mask included.
-        dtype: NumPy dtype it is stored in.
-        inner_shape: shape without the action mask.
-        num_categories: number of states if the observation is a state index, else None.
-        masked: whether an action mask is appended.
-        num_actions: A.
-        frame_scaling: of frames of bytes, how the network is to scale them; other numbers are scaled already.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    inner_shape: tuple[int, ...]
-    num_categories: int | None
-    masked: bool
-    num_actions: int
-    frame_scaling: Scaling | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +73,8 @@ class Interaction:
         seed: of the first reset; None continues the environments' own randomness.
         as_index: encode finite observations as one index, for tables.
         normalisation: through which observations and the rewards of transitions are seen; episode returns are not.
+        memory_size: numbers that whoever acts remembers of an episode; ``next_memory`` is then to be set, from
+            observations with their memories ``[N, d + M …]`` to the memories after them ``[N, M]``.
 
     Raises:
         ValueError: for spaces that cannot be learned from and environments that do not say how they restart.
@@ -108,6 +87,7 @@ class Interaction:
         seed: int | None,
         as_index: bool = False,
         normalisation: Normalisation | None = None,
+        memory_size: int = 0,
     ) -> None:
         check_discount("discount", discount)
         self.envs = envs
@@ -123,6 +103,8 @@ class Interaction:
         if isinstance(inner, SyncVectorEnv):
             inner.envs = [e if isinstance(e, SubEnv) else SubEnv(e, i) for i, e in enumerate(inner.envs)]
         self.num_steps = 0
+        self.next_memory: Callable[[Array], Array] | None = None
+        self._memory = np.zeros((self.num_envs, memory_size), np.float32)  # before what is observed next
         self._everyone = np.arange(self.num_envs)
         self._discounts = np.full(self.num_envs, self.discount)
         self._broken = False
@@ -139,7 +121,7 @@ class Interaction:
         encoder, masked = self.encoder, self._mask is not None
         return ObservationSpec(
             self._s.shape[1:], self._s.dtype, encoder.shape, encoder.num_categories, masked, self.num_actions,
-            encoder.frame_scaling,
+            encoder.frame_scaling, self._memory.shape[1], encoder.dtype if self._memory.shape[1] else None,
         )  # fmt: skip
 
     def restart(self, seed: int | None) -> None:
@@ -155,6 +137,7 @@ class Interaction:
         self._pending[:] = False
         self._returns[:] = 0
         self._lengths[:] = 0
+        self._memory[:] = 0
         self._s = self._observe(observation, info, self._everyone)
 
     def _observe(
@@ -166,7 +149,7 @@ class Interaction:
         """
         encoded = self._normalised(self._encoded(observation), env_indices)
         self._take_masks(info, env_indices, over)
-        return encoded if self._mask is None else self._with_mask(encoded, self._mask)
+        return self._joined(encoded, self._mask)
 
     def _encoded(self, observation: Any) -> Array:
         try:
@@ -211,9 +194,15 @@ class Interaction:
             legal[row] = True  # the world has ended: nothing is chosen, and a discount of 0 ignores what is best there
         return legal
 
-    def _with_mask(self, encoded: Array, mask: Array) -> Array:
+    def _joined(self, encoded: Array, mask: Array | None) -> Array:
+        """Observations with what is remembered from before them, and with their masks, where there are such."""
+        if mask is None and self._memory.shape[1] == 0:
+            return encoded
         flat = encoded.reshape(len(encoded), -1)
-        return np.concatenate([flat, mask.astype(flat.dtype)], axis=1)  # bytes stay bytes, indices indices
+        if self._memory.shape[1]:
+            flat = np.concatenate([flat.astype(np.float32), self._memory], axis=1)
+        # Bytes stay bytes, indices indices.
+        return flat if mask is None else np.concatenate([flat, mask.astype(flat.dtype)], axis=1)
 
     def _fault_in(self, env_index: int, what: str) -> EnvironmentFault:
         return self._fault(f"environment {env_index}, step {self._lengths[env_index] + 1} of its episode, field {what}")
@@ -235,7 +224,7 @@ class Interaction:
         """
         if self._broken:
             raise EnvironmentFault("this interaction has ended with an error; start a new one")
-        chosen, mu = _act(policy, self._s)
+        chosen, mu = self._act(policy)
         threads = torch.get_num_threads()
         try:
             observation, reward, terminated, truncated, info = self.envs.step(chosen + self._first_action)
@@ -270,6 +259,17 @@ class Interaction:
         if not (self.mode is AutoresetMode.DISABLED and episodes):
             self._s = arrived
         return Step(rows, env_indices, episodes)
+
+    def _act(self, policy: Policy) -> tuple[Array, Array]:
+        """Actions and their probabilities; what was seen is remembered."""
+        if self.next_memory is not None:
+            self._memory = self.next_memory(self._s)
+            self._memory[self._pending] = 0  # a new episode begins
+        on_arrays = getattr(policy, "on_arrays", None)
+        if on_arrays is not None:
+            return on_arrays(self._s)  # type: ignore[no-any-return]
+        action, mu = policy(torch.from_numpy(self._s))
+        return action.numpy(), mu.numpy()
 
     def _flags(self, field: str, value: Any) -> Array:
         """Which episodes have ended, ``[N]`` bool; what is neither yes nor no would be cast to either."""
@@ -313,11 +313,13 @@ class Interaction:
         arrived = arrived.copy()
         arrived[ended] = self._normalised(fresh, ended)[ended]
         self._take_masks(info, self._everyone, None)
-        if self._mask is None:
-            return s_t, arrived
-        mask = self._mask.copy()
-        mask[ended] = self._legal(info.get("final_info", {}), ended, terminated)
-        return self._with_mask(s_t, mask), self._with_mask(arrived, self._mask)
+        mask = self._mask
+        if mask is not None:
+            mask = mask.copy()
+            mask[ended] = self._legal(info.get("final_info", {}), ended, terminated)
+        s_t = self._joined(s_t, mask)
+        self._memory[ended] = 0
+        return s_t, self._joined(arrived, self._mask)
 
     def _final(self, info: Mapping[str, Any], env_index: int) -> Array:
         try:
@@ -339,6 +341,7 @@ class Interaction:
                 observation, info = self.envs.reset(options={"reset_mask": last})
             except (Exception, SystemExit) as error:
                 raise self._fault(describe_error(error)) from error
+            self._memory[ended] = 0
             fresh = self._observe(observation, info, ended)
             self._s = arrived.copy()
             self._s[ended] = fresh[ended]
@@ -380,14 +383,6 @@ class Interaction:
         self.encoder.require_scalings(state.get("scalings"))
         if self.normalisation is not None:
             self.normalisation.load_state_dict(state["normalisation"])
-
-
-def _act(policy: Policy, s: Array) -> tuple[Array, Array]:
-    on_arrays = getattr(policy, "on_arrays", None)
-    if on_arrays is not None:
-        return on_arrays(s)  # type: ignore[no-any-return]
-    action, mu = policy(torch.from_numpy(s))
-    return action.numpy(), mu.numpy()
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any]) -> AutoresetMode:

@@ -23,7 +23,8 @@ from neuralq.mdp import FiniteMDP
 from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.stream.encoding import Encoder, ObservationError, discrete_actions, encoder_for
 from neuralq.runs.stream.faults import EnvironmentFault, describe_error
-from neuralq.runs.stream.stream import Episode, ObservationSpec, Step
+from neuralq.runs.stream.spec import ObservationSpec
+from neuralq.runs.stream.stream import Episode, Step
 from neuralq.runs.stream.vector_env import MASK_METHODS, legal_actions
 from neuralq.tabular.kernels.acting import EPISODE_STEPS, LIMIT, RECORD, REPLAY, STEP, new_log
 from neuralq.tabular.model import Model, compile_model
