@@ -295,12 +295,14 @@ def shortest(world: World, care: int) -> float:
 
 def test_the_teacher_takes_a_shortest_way_that_is_safe_or_flees() -> None:
     rng, cares = np.random.default_rng(5), []
-    for _ in range(60):
+    for n in range(80):
         world = new_world()
         settle(world, rng.random(int(rng.integers(1, 4))))
         cells = world.free[rng.permutation(len(world.free))[:4]]
         world.agent[:2] = cells[0] if world.food[tuple(cells[0])] == 0 else world.start[:2]
         world.enemies[:3], world.enemies[3] = cells[1:], world.agent[:2] + rng.integers(-3, 4, 2)
+        if n % 2:  # all of them are near
+            world.enemies[:] = world.agent[:2] + rng.integers(-3, 4, (4, 2))
         a = advised(world, new_plan(world))
         care = next((care for care in (3, 2, 1) if math.isfinite(shortest(world, care))), 0)
         cares.append(care)
@@ -315,7 +317,7 @@ def test_the_teacher_takes_a_shortest_way_that_is_safe_or_flees() -> None:
                 int(np.abs(world.enemies - at).sum(axis=1).min()) for at in beside if not world.obstacles[tuple(at)]
             ]
             assert np.abs(world.enemies - to).sum(axis=1).min() == max(away)
-    assert set(cares) == {0, 1, 2, 3}
+    assert min(np.bincount(cares, minlength=4)) >= 5
 
 
 def test_models_count_where_the_agent_was_for_an_enemy() -> None:
