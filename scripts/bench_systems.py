@@ -47,6 +47,12 @@ def classifiers(num_problems: int) -> None:
     live(0, num_problems=num_problems)
 
 
+def transition_hierarchies(num_steps: int) -> None:
+    from neuralq.systems.child.lives import live
+
+    live(0, mazes=(9,), from_nothing=True, limit=num_steps)
+
+
 def compositional(num_trials: int) -> None:
     import numpy as np
 
@@ -137,6 +143,7 @@ WORK = {
     "bucket-brigade": Work("10,000 problems of ZCS in Woods1", classifiers, 10_000, 20),
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),
     "checkers-perft": Work("perft 9, 3,963,680 ways", checkers_perft, 302, 2, 1.0),
+    "child": Work("200,000 steps in the ninth maze, from nothing", transition_hierarchies, 200_000, 2000),
     "ebnn": Work("3,000 steps on 20 points and their slopes", fit_to_slopes, 3000, 100),
     "elevators": Work("10,000 simulated hours of elevators", elevators, 10_000, 10, most_seconds=15.0),
     "hierarchies": Work("4,000 trials of CQ-L, half of them composite", compositional, 2000, 50),

@@ -74,6 +74,7 @@ WITHOUT_MODEL = {
     "neuralq/Obelix-v0": Registration("neuralq_envs.obelix", has_vector=False, max_episode_steps=100),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
+    "neuralq/RingMaze-v0": Registration("neuralq_envs.ring_mazes", has_vector=False, max_episode_steps=1000),
     "neuralq/ThrunRobot-v0": Registration("neuralq_envs.thrun_robot", has_vector=False, max_episode_steps=30),
     "neuralq/Woods1-v0": Registration("neuralq_envs.woods", has_vector=False, max_episode_steps=500),
 }

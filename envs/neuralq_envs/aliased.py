@@ -23,7 +23,7 @@ from neuralq.checks import check_choice
 from neuralq.mdp import AliasedMDP
 from neuralq_envs import dyna
 from neuralq_envs.grids import Grid
-from neuralq_envs.rendering import RenderedEnv
+from neuralq_envs.rendering import RenderedEnv, Scene
 
 __all__ = ["AliasedGridEnv", "littman", "littman_grid", "make", "mccallum", "mccallum_grid", "walked"]
 
@@ -106,8 +106,9 @@ class AliasedGridEnv(gymnasium.Env[Any, Any]):
 
     Args:
         model: the grid's model with its percepts.
-        grid: the grid.
+        grid: the grid, or what else shows a cell.
         render_mode: None, ``"ansi"`` or ``"rgb_array"``; both show the cell.
+        num_observations: if there are more than occur here.
 
     Raises:
         ValueError: another render mode.
@@ -120,11 +121,14 @@ class AliasedGridEnv(gymnasium.Env[Any, Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
 
-    def __init__(self, model: AliasedMDP, grid: Grid, render_mode: str | None = None) -> None:
+    def __init__(
+        self, model: AliasedMDP, grid: Scene, render_mode: str | None = None, num_observations: int | None = None
+    ) -> None:
         self._cells = RenderedEnv(model.mdp, grid, render_mode)
         self.render_mode = render_mode
         self.model = model
-        self.observation_space, self.action_space = Discrete(model.num_observations), Discrete(model.mdp.num_actions)
+        self.observation_space = Discrete(num_observations or model.num_observations)
+        self.action_space = Discrete(model.mdp.num_actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
         """A first cell drawn from the starts, or ``options["state"]``."""

@@ -40,6 +40,7 @@ SYSTEMS = {
     "checkers": SystemEntry(
         "neuralq.systems.checkers:CHECKERS", "checkers, learned from its own search and by rote", 85
     ),
+    "child": SystemEntry("neuralq.systems.child:CHILD", "nine mazes, each learned with what the last ones taught", 20),
     "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen", 40),
     "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop", 85),
     "hierarchies": SystemEntry(

@@ -39,6 +39,14 @@ from neuralq.tabular.kernels.compositional import (
 )
 from neuralq.tabular.kernels.random_numbers import new_stream
 from neuralq.tabular.kernels.semi_markov import smdp_q_update
+from neuralq.tabular.kernels.transition_hierarchy import (
+    HierarchyRates,
+    TransitionHierarchy,
+    hierarchy_begin,
+    hierarchy_learn,
+    hierarchy_observe,
+    new_transition_hierarchy,
+)
 from neuralq.tabular.kernels.zcs import Zcs, ZcsRates, new_zcs, zcs_action, zcs_strengths, zcs_update
 from neuralq.tabular.look_ahead import Backup, alpha_beta
 from neuralq.tabular.model import Model, compile_model
@@ -75,6 +83,7 @@ __all__ = [
     "Curve",
     "EpsilonGreedy",
     "Experience",
+    "HierarchyRates",
     "KToTheQ",
     "Learned",
     "Model",
@@ -90,6 +99,7 @@ __all__ = [
     "Softmax",
     "SuffixNode",
     "Sweeps",
+    "TransitionHierarchy",
     "UpperConfidence",
     "UtileSuffixMemory",
     "Visits",
@@ -119,10 +129,14 @@ __all__ = [
     "dyna_q",
     "episodic_q_learning",
     "expected_sarsa",
+    "hierarchy_begin",
+    "hierarchy_learn",
+    "hierarchy_observe",
     "n_step",
     "new_ase_ace",
     "new_compositional_q",
     "new_stream",
+    "new_transition_hierarchy",
     "new_zcs",
     "over_seeds",
     "predict",
