@@ -250,7 +250,7 @@ def test_a_presets_network_is_left_out_where_there_is_none(capsys: Capture) -> N
         ("gamma: true", "gamma must be a number, got True"),
         ("rollout: {anneal: 1}", "rollout.anneal must be true or false, got 1"),
         ("rollout: 5", "rollout must be a mapping, got 5"),
-        ("body: {class: Transformer}", "class of the body must be one of 'MLP', 'Conv', 'Custom', 'GRU', got 'Transformer'"),
+        ("body: {class: Deep}", "class of the body must be one of 'MLP', 'Conv', 'Custom', 'GRU', got 'Deep'"),
         ("body: {class: MLP, hidden: 64}", "body.hidden must be a list, got 64"),
         ("body: {class: MLP, hidden: [a]}", "body.hidden[0] must be a whole number, got 'a'"),
         ("- 5", "must hold a mapping of options, got list"),
@@ -314,7 +314,8 @@ def test_every_layout_goes_with_every_learner(layout: str, learner: str, tmp_pat
         (["--env-kwargs", "{x"], "--env-kwargs must be a mapping, got {x"),
         (
             ["--body", "3"],
-            "body must be a mapping with a class, one of mlp, minatar, conv, gru, or 'module:Class' of your own, got '3'",
+            "body must be a mapping with a class, one of mlp, minatar, conv, gru, or 'module:Class' of your own, "
+            "got '3'",
         ),
         (["--foo", "3"], "unrecognized arguments: --foo 3; `neuralq train --help` lists the options"),
         (["Acrobot-v1"], "one environment at a time, got 'CartPole-v1' and 'Acrobot-v1'"),

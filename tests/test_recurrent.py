@@ -20,6 +20,7 @@ from neuralq.q import GRU, MLP, ActionInputQ, ActionOutputQ, DuelingQ, MaskedQ, 
 from neuralq.q.engine import Loss, TorchEngine
 from neuralq.q.inputs import OneHot, Pixels
 from neuralq.q.recurrent import recurrent_part
+from neuralq.rules import lambda_returns
 from neuralq.runs import RunConfig
 from neuralq.runs.loop import seed_for
 from neuralq.runs.recipe.build import build_session
@@ -244,8 +245,13 @@ def test_burning_in_brings_the_first_memory_up_to_date(burn_in: int) -> None:
     settings = ReplaySettings(target_rule="peng", block_length=2, burn_in=burn_in, batch_size=8, loss="squared")
     learner = ReplayLearner(engine, settings)
     values, _ = slowly(q, steps.s_tm1, steps.last_t)
-    update = learner.update(steps.map(lambda x: x[: burn_in + 2]))
     taken = values.gather(-1, steps.a_tm1[..., None])[burn_in : burn_in + 2, :, 0]
+    rows = slice(burn_in, burn_in + 2)
+    after = q.next_memory(torch.cat([steps.s_tm1[rows, :, :D], memories[rows]], -1).flatten(0, 1)).unflatten(0, (2, B))
+    v_t = q.all(torch.cat([steps.s_t[rows, :, :D], after], -1)).amax(-1).detach()
+    update = learner.update(steps.map(lambda x: x[: burn_in + 2]))
+    returns = lambda_returns(steps.r_t[rows], steps.discount_t[rows], v_t, 0.8, steps.last_t[rows])
+    torch.testing.assert_close(update.targets, returns.reshape(-1), rtol=0, atol=1e-12)
     torch.testing.assert_close(update.targets - update.errors, taken.detach().reshape(-1), rtol=0, atol=1e-12)
 
 

@@ -186,7 +186,7 @@ def test_the_page_says_what_came_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_regions_pay_among_rectangles_and_not_among_random_walls() -> None:
-    found = run_system(system_named("regions"))
+    found = run_system(system_named("regions"), 12)
     median = {one.what.partition(":")[0]: one.median for one in found.measured}
     assert len(found.measured[0].values) == 12 and found.reproduced and not found.wrong
     assert median["15 rectangles, 100 x 100"] <= 0.12 and median["40 rectangles, 100 x 100"] <= 0.12

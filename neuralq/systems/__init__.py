@@ -54,7 +54,7 @@ SYSTEMS = {
     "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory", 25),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours", 25),
     "peng-williams": SystemEntry("neuralq.systems.peng_williams:PENG_WILLIAMS", "the pole again, by Q(λ)", 15),
-    "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once", 175),
+    "regions": SystemEntry("neuralq.systems.regions:REGIONS", "whole regions of a maze, backed up at once", 50),
     "thrun-robot": SystemEntry(
         "neuralq.systems.thrun_robot:THRUN_ROBOT", "a robot that explains its way to a target", 100
     ),

@@ -137,6 +137,6 @@ REGIONS = System(
     baselines=_RANDOM,
     oracle=oracle,
     page=_page,
-    num_seeds=12,
+    num_seeds=6,
     full_num_seeds=30,
 )
