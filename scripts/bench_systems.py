@@ -41,6 +41,15 @@ def pole_ase_ace(num_trials: int) -> None:
     train(0, long_trial_steps=10_000, most_failures=num_trials)
 
 
+def advised(num_games: int) -> None:
+    import numpy as np
+
+    from neuralq.systems.advice.rules import GOOD
+    from neuralq.systems.advice.studies import study
+
+    study(np.random.SeedSequence(0), GOOD, num_games=num_games, test_every=max(num_games, 500))
+
+
 def classifiers(num_problems: int) -> None:
     from neuralq.systems.bucket_brigade.lives import live
 
@@ -139,6 +148,7 @@ def checkers_perft(num_positions: int) -> None:
 
 
 WORK = {
+    "advice": Work("8,000 games of Pengo with advice, 400 of test", advised, 8000, 20),
     "ase-ace": Work("60 trials of ASE/ACE", pole_ase_ace, 60, 20),
     "bucket-brigade": Work("10,000 problems of ZCS in Woods1", classifiers, 10_000, 20),
     "checkers": Work("500 games learned from, three plies", checkers_learning, 500, 1, 10.0),

@@ -108,7 +108,7 @@ def place(item: pytest.Item, sizes: Counter[Path]) -> tuple[int, int, str]:
 # pages in a browser, pictures, and what holds every environment, every update on an accelerator and every case of the
 # doctor. `make whole` runs these, and single tests that are marked `whole`; CI does so too.
 WHOLE = (
-    *("test_backgammon", "test_backgammon_expert", "test_backgammon_fuzz", "test_backgammon_learning"),
+    *("test_advice", "test_backgammon", "test_backgammon_expert", "test_backgammon_fuzz", "test_backgammon_learning"),
     *("test_backgammon_match", "test_backgammon_oracles", "test_backgammon_play", "test_backgammon_run"),
     *("test_bucket_brigade", "test_checkers", "test_checkers_learning", "test_child", "test_elevators"),
     *("test_figure_13_2", "test_hierarchies", "test_job_shop", "test_lin", "test_mccallum", "test_obelix"),

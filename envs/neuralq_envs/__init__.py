@@ -72,6 +72,7 @@ WITHOUT_MODEL = {
         "neuralq_envs.aliased", {"maze": "mccallum"}, has_vector=False, max_episode_steps=200
     ),
     "neuralq/Obelix-v0": Registration("neuralq_envs.obelix", has_vector=False, max_episode_steps=100),
+    "neuralq/Pengo-v0": Registration("neuralq_envs.pengo", has_vector=False, max_episode_steps=60),
     # A pole that is balanced for good would never end an episode.
     "neuralq/PoleBoxes-v0": Registration("neuralq_envs.pole", has_vector=False, max_episode_steps=10_000),
     "neuralq/RingMaze-v0": Registration("neuralq_envs.ring_mazes", has_vector=False, max_episode_steps=1000),

@@ -33,6 +33,7 @@ class SystemEntry(NamedTuple):
 
 
 SYSTEMS = {
+    "advice": SystemEntry("neuralq.systems.advice:ADVICE", "rules told to a learner of Pengo, and refined", 80),
     "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic", 10),
     "bucket-brigade": SystemEntry(
         "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods", 35
