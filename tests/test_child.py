@@ -127,7 +127,10 @@ def test_a_hierarchy_is_its_formulas(num_outputs: int, room: int, max_delay: int
 
 
 def test_a_moment_that_never_was_teaches_nothing() -> None:
-    net = new_transition_hierarchy(2, 1)
+    net = new_transition_hierarchy(2, 1, max_delay=1)
+    for _ in range(9):
+        hierarchy_observe(net, np.full(2, 7.0))  # before the beginning
+    hierarchy_begin(net)
     hierarchy_observe(net, np.ones(2))
     hierarchy_learn(net, HierarchyRates(), np.ones(1), 1)
     assert not net.weight.any()
@@ -195,6 +198,13 @@ def test_the_model_of_the_cells_is_the_maze() -> None:
     assert [len(shortest_way(maze)) for maze in range(1, 10)] == [4, 5, 7, 10, 12, 14, 17, 18, 20]
 
 
+def test_a_maze_pays_what_it_is_told() -> None:
+    env = make(maze=1, step_reward=0.5, goal_reward=2.0)
+    env.reset()
+    assert [env.step(a)[1] for a in shortest_way(1)] == [0.5, 0.5, 0.5, 2.0]
+    assert {make(maze=maze).observation_space.n for maze in range(1, 10)} == {16}
+
+
 def test_a_maze_can_be_looked_at() -> None:
     env = make("ansi", maze=2)
     env.reset(seed=0)
@@ -213,10 +223,11 @@ def test_a_context_of_k_moments_grows_a_chain_of_k_units(k: int) -> None:
     assert oracle.learn_context(k, grows=False).error > 0.8  # what must fail
 
 
-def test_a_life_is_q_learning_on_the_outputs() -> None:
+@pytest.mark.parametrize("settings", [lives.Settings(), lives.GOAL_ONLY])
+def test_a_life_is_q_learning_on_the_outputs(settings: lives.Settings) -> None:
     """The same steps in Python; the stream is drawn as the kernel draws it."""
-    settings, limit = lives.Settings(), 700
-    found = lives.live(3, mazes=(1, 2), limit=limit)
+    limit, (gamma, step, goal) = 1000, settings.rewards
+    found = lives.live(3, settings, mazes=(1, 2), limit=limit)
     stream = new_stream(3)
     net = new_transition_hierarchy(lives.NUM_INPUTS, 4, settings.max_units)
 
@@ -248,7 +259,7 @@ def test_a_life_is_q_learning_on_the_outputs() -> None:
                 steps += 1
                 if s != 1:
                     see(one.percepts[s], a)
-                target = 0.0 if s == 1 else -1.0 + 0.97 * net.value[best()]
+                target = goal if s == 1 else step + gamma * net.value[best()]
                 hierarchy_learn(net, settings.rates, np.eye(4)[a] * (target - q), int(s != 1))
             trials += s == 1
             if s == 1 and trials % 5 == 0:
@@ -261,7 +272,7 @@ def test_a_life_is_q_learning_on_the_outputs() -> None:
                         at = int(one.led[at, a])
                 walked = at == 1
         taken.append(steps if walked else limit + 1)
-    assert found.steps == tuple(taken) and np.array_equal(found.net.weight, net.weight)
+    assert found.steps == tuple(taken) and found.solved[0] and np.array_equal(found.net.weight, net.weight)
 
 
 @pytest.mark.slow

@@ -321,6 +321,15 @@ def test_runs_go_on_bit_for_bit(learner: dict[str, Any], tmp_path: Any) -> None:
     assert (half.parameters_sha256, half.greedy_return) == (whole.parameters_sha256, whole.greedy_return)
 
 
+def test_blocks_from_replay_are_as_long_as_what_is_learned_from_and_what_is_not() -> None:
+    session = build_session(neuralq.with_preset({"env": "CartPole-v1", **SMALL, **REPLAY, "resume_probe": False}))
+    session.advance(80, StopRequest())
+    assert session.observed is not None
+    learned, sample = session._last  # type: ignore[misc]
+    assert sample.transition.r_t.shape == (2 + 4, 16 // 4) and learned.errors.shape == (16,)
+    session.close()
+
+
 def test_an_agent_plays_by_hand_as_its_evaluation_did(tmp_path: Any) -> None:
     run = neuralq.train({"env": "CartPole-v1", **SMALL, **ROLLOUT, "total_steps": 64}, tmp_path / "run")
     agent = neuralq.load(run)

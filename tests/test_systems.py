@@ -130,7 +130,7 @@ class Balanced(HTMLParser):
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["--seeds", "3"], "--seeds and --full are for systems, and nothing is named; the systems are ase-ace, "),
+        (["--seeds", "3"], "--seeds and --full are for systems, and nothing is named; the systems are advice, "),
         (["fig-13.2", "--full"], "are for systems, and fig-13.2 is none"),
         (["ase-ace", "--seeds", "0"], "--seeds must be at least 1, got 0"),
         (["ase-ace", "--svg", "x.svg"], "--svg is for figures and exercises; ase-ace writes a page: --html FILE"),

@@ -50,7 +50,7 @@ SYSTEMS = {
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules", 95
     ),
-    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching", 60),
+    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching", 80),
     "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike", 10),
     "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory", 25),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours", 25),

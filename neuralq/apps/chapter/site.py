@@ -40,9 +40,9 @@ class Elsewhere(NamedTuple):
 
 
 ELSEWHERE = {
-    "13.1": Elsewhere("neuralq train td-gammon", "backgammon, learned by self-play", "25 min"),
+    "13.1": Elsewhere("neuralq train td-gammon --games 100000", "backgammon, learned by self-play", "90 s"),
     "13.4": Elsewhere("neuralq train FrozenLake-v1 --learner tabular", "Q-learning where moves slip", "3 s"),
-    "13.6": Elsewhere("neuralq train CartPole-v1 --layout separate", "one of the chapter's three layouts", "30 s"),
+    "13.6": Elsewhere("neuralq train CartPole-v1 --layout separate", "one of the chapter's three layouts", "15 s"),
     "13.7": Elsewhere("neuralq solve FrozenLake-v1 --gamma 0.95", "the same values, computed", "2 s"),
 }
 """Of sections that have no page."""

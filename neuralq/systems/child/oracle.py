@@ -8,7 +8,7 @@ import numpy as np
 
 from neuralq.checks import check_whole
 from neuralq.exact import solve
-from neuralq.runs.report.claims import Row, claim, number, own
+from neuralq.runs.report.claims import Row, claim, number
 from neuralq.tabular import (
     HierarchyRates,
     hierarchy_begin,
@@ -100,6 +100,7 @@ def oracle() -> tuple[Row, ...]:
     blind = [learn_context(k, grows=False).error for k in lengths]
     shortest = [round(1.0 - solve(model(maze).mdp, 1.0).v[0]) for maze in range(1, NUM_MAZES + 1)]
     ways = [len(shortest_way(maze)) for maze in range(1, NUM_MAZES + 1)]
+    needed = [moments_needed(maze) for maze in range(1, NUM_MAZES + 1)]
     return (
         claim(
             f"a context of k = 1 … {_LONGEST} moments: units that each of two outputs grows",
@@ -116,9 +117,11 @@ def oracle() -> tuple[Row, ...]:
             ", ".join(map(str, shortest)),
             ways == shortest,
         ),
-        own(
+        claim(
             "moments before the present one that the shortest way needs",
-            ", ".join(str(moments_needed(maze)) for maze in range(1, NUM_MAZES + 1)),
+            "none in the first two mazes, then some",
+            ", ".join(map(str, needed)),
+            not any(needed[:2]) and all(needed[2:]),
             "beside what is seen and what was done last",
         ),
     )

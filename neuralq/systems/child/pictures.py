@@ -134,8 +134,8 @@ def _rows(net: TransitionHierarchy, num_units: int) -> dict[int, int]:
 def _moment(x: float, y: float, at: int) -> str:
     """A cell with its walls, and in it the move that led there."""
     percept, a = divmod(at, NUM_ACTIONS + 1)
-    parts = [f'<rect x="{x - 9:g}" y="{y - 9:g}" width="18" height="18" fill="#dbe9f6"/>']
-    parts += [_line(x - 9, y - 9, side, 18, "#1b1f24", 2.2) for side in range(4) if percept >> side & 1]
+    parts = [f'<rect x="{x - 11:g}" y="{y - 11:g}" width="22" height="22" fill="#dbe9f6"/>']
+    parts += [_line(x - 8.5, y - 8.5, side, 17, "#1b1f24", 2.4) for side in range(4) if percept >> side & 1]
     parts.append(_arrow(x, y, a - 1, "#1b1f24") if a else f'<circle cx="{x:g}" cy="{y:g}" r="3" fill="#1b1f24"/>')
     return "".join(parts)
 

@@ -148,7 +148,6 @@ def hierarchy_begin(net: TransitionHierarchy) -> None:
     """
     net.counts[_MOMENTS] = 0
     net.value[:] = 0.0
-    net.before[:] = 0.0
 
 
 @lean_kernel
