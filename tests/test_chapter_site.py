@@ -57,6 +57,7 @@ def test_what_was_made_can_be_read_when_the_rest_was_stopped(tmp_path: Path) -> 
     assert re.findall(r'href="(.*?)\.html"', index) == ["fig-13.2"] and "2 pages are still to be made" in index
 
 
+@pytest.mark.whole
 def test_every_page_and_system_belongs_to_a_section_that_there_is() -> None:
     names = [*chapter.PAGES, *SYSTEMS]
     assert sorted(name for _, some in by_section(names) for name in some) == sorted(names)

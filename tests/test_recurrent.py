@@ -305,6 +305,7 @@ REPLAY = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("learner", [ROLLOUT, REPLAY], ids=["rollout", "replay"])
 def test_runs_go_on_bit_for_bit(learner: dict[str, Any], tmp_path: Any) -> None:
     config = {"env": "CartPole-v1", **SMALL, **learner}
@@ -350,6 +351,7 @@ def test_an_agent_plays_by_hand_as_its_evaluation_did(tmp_path: Any) -> None:
     assert tuple(returns) == neuralq.evaluate(run, num_episodes=2, seed=0).returns
 
 
+@pytest.mark.whole
 def test_the_file_is_one_step_of_the_memory(tmp_path: Any) -> None:
     pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")

@@ -149,6 +149,7 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 
 
+@pytest.mark.whole
 def test_a_run_begins_with_its_rules_and_is_loaded_with_them_once(tmp_path: Path) -> None:
     plain = neuralq.train("CartPole-v1", tmp_path / "plain", hidden=(8,), **SMALL)
     told = neuralq.train("CartPole-v1", tmp_path / "told", hidden=(8,), rules=BALANCE, **SMALL)
