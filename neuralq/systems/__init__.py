@@ -33,7 +33,7 @@ class SystemEntry(NamedTuple):
 
 
 SYSTEMS = {
-    "advice": SystemEntry("neuralq.systems.advice:ADVICE", "rules told to a learner of Pengo, and refined", 80),
+    "advice": SystemEntry("neuralq.systems.advice:ADVICE", "rules told to a learner of Pengo, and refined", 60),
     "ase-ace": SystemEntry("neuralq.systems.ase_ace:ASE_ACE", "a pole balanced by the first actor-critic", 10),
     "bucket-brigade": SystemEntry(
         "neuralq.systems.bucket_brigade:BUCKET_BRIGADE", "rules that pay each other, and find food in the woods", 35
@@ -45,12 +45,12 @@ SYSTEMS = {
     "ebnn": SystemEntry("neuralq.systems.ebnn:EBNN", "slopes from a theory that explains what was seen", 40),
     "elevators": SystemEntry("neuralq.systems.elevators:ELEVATORS", "four elevators that learn when to stop", 85),
     "hierarchies": SystemEntry(
-        "neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills", 105
+        "neuralq.systems.hierarchies:HIERARCHIES", "tasks made of tasks, by modules and skills", 75
     ),
     "job-shop": SystemEntry(
         "neuralq.systems.job_shop:JOB_SHOP", "a schedule repaired by what was learned of schedules", 95
     ),
-    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching", 80),
+    "lin": SystemEntry("neuralq.systems.lin:LIN", "to eat and not to be eaten, by replay and by teaching", 90),
     "littman": SystemEntry("neuralq.systems.littman:LITTMAN", "the best way through a maze where cells look alike", 10),
     "mccallum": SystemEntry("neuralq.systems.mccallum:MCCALLUM", "a maze that can only be learned with a memory", 25),
     "obelix": SystemEntry("neuralq.systems.obelix:OBELIX", "a robot that learns to push boxes, by behaviours", 25),
