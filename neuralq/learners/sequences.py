@@ -42,9 +42,7 @@ def recalled(engine: Engine, transition: Transition, target: bool = False) -> Tr
     """
     q = _network(engine, target)
     s_tm1, after = q.recalled(transition.s_tm1, transition.last_t)
-    end = q.width + q.memory_size
-    s_t = torch.cat([transition.s_t[..., : q.width], after, transition.s_t[..., end:]], -1)
-    return dataclasses.replace(transition, s_tm1=s_tm1, s_t=s_t)
+    return dataclasses.replace(transition, s_tm1=s_tm1, s_t=q.with_memory(transition.s_t, after))
 
 
 @torch.no_grad()

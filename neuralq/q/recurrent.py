@@ -211,6 +211,11 @@ class RecurrentQ(nn.Module):
         """Values of the given actions: ``([*n, d + M], [*n] int64) -> [*n]``."""
         return self.inner.at(self._vectors(s), a)
 
+    def with_memory(self, s: Tensor, memory: Tensor) -> Tensor:
+        """The observations with another memory, and what follows it: ``[*n, d + M …], [*n, M] -> [*n, d + M …]``."""
+        end = self.width + self.memory_size
+        return torch.cat([s[..., : self.width].to(memory.dtype), memory, s[..., end:].to(memory.dtype)], -1)
+
     def next_memory(self, s: Tensor) -> Tensor:
         """What is remembered after the observations: ``[B, d + M …] -> [B, M]``; what follows, a mask, is not read."""
         stem = self.stem
@@ -240,10 +245,8 @@ class RecurrentQ(nn.Module):
             before.append(memory)
             memory = stem.step(driven[:, t], memory)
             after.append(memory)
-        rows = torch.cat([stem.joined(m)[None] for m in before])
-        end = self.width + self.memory_size
-        joined = torch.cat([s[..., : self.width].to(rows.dtype), rows, s[..., end:].to(rows.dtype)], -1)
-        return joined, torch.cat([stem.joined(m)[None] for m in after])
+        rows, afterwards = (torch.stack([stem.joined(m) for m in some]) for some in (before, after))
+        return self.with_memory(s, rows), afterwards
 
 
 def recurrent_part(q: object) -> RecurrentQ | None:
