@@ -80,7 +80,12 @@ class LocalProcesses:
 
     def start(self, task: Task) -> None:
         """Begin a task in a process of its own."""
-        refuse_links(task.path.parent, [task.path.name])
+        folder = task.path.parent
+        refuse_links(folder, [task.path.name])
+        if "/" in task.name:
+            refuse_links(folder.parent, [folder.name])
+        folder.mkdir(parents=True, exist_ok=True)
+        os.close(open_regular(task.log_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC))
         process = run_forked(task, self._threads, self._config)
         self._running[process.sentinel] = (task, process)
 
@@ -131,9 +136,7 @@ def run_forked(task: Task, num_threads: int = 1, config: Mapping[str, Any] | Non
 
 def _child(task: Task) -> None:
     os.setsid()  # the terminal's Ctrl-C reaches the parent alone, which passes it on in order
-    task.log_path.parent.mkdir(parents=True, exist_ok=True)
     log = open_regular(task.log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.ftruncate(log, 0)
     for descriptor in (1, 2):
         os.dup2(log, descriptor)
     sys.stdout = open(1, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
