@@ -242,9 +242,9 @@ def cell_name(options: Mapping[str, Any]) -> str:
 
     Example:
         >>> cell_name({"learning_rate": 0.001, "hidden": [64, 64]})
-        'learning_rate=0.001,hidden=64-64-64dfe2bd'
+        'learning_rate=0.001-hidden=64-64-d0a7206d'
     """
-    words = ",".join(f"{name}={value}" for name, value in options.items())
-    slug = re.sub(r"[^A-Za-z0-9._=,+]+", "-", words.replace(", ", "-").replace("'", ""))[:80].strip(".-,")
+    words = ",".join(f"{name}={json.dumps(value, ensure_ascii=False)}" for name, value in options.items())
+    slug = re.sub(r"[^A-Za-z0-9._=,+]+", "-", re.sub(r"[\"\[\]{} ]", "", words).replace(",", "-"))[:80].strip(".-")
     digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
     return f"{slug}-{digest}"
