@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +34,10 @@ _CURVE_RESAMPLES = 1_000
 
 @dataclass(frozen=True)
 class SeedRun:
-    """One run: its folder, seed, greedy evaluations ``[E]``, what its agent scores, and costs."""
+    """One run: its folder, seed, greedy evaluations ``[E]``, what its agent scores, and costs.
+
+    Its task is what it shares with the runs that differ from it in nothing but their seed, where others are compared.
+    """
 
     path: Path
     seed: int
@@ -41,17 +46,18 @@ class SeedRun:
     score: Score
     env_steps: int
     cpu_seconds: float
+    task: str = ""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in their seed alone.
+    """Runs that differ in their seed alone, or that have the value of one option in common.
 
     Args:
         name: of the sweep's folder, or of the first run's.
         label: what sets the group apart, in words; its name where that is not short and clear.
         settings: of its configuration, those in which the groups differ.
-        runs: one per seed, each with at least one greedy evaluation.
+        runs: each with at least one greedy evaluation; one per seed, of each task.
     """
 
     name: str
@@ -66,8 +72,12 @@ class Group:
 
     @property
     def estimate(self) -> Estimate:
-        """Their interquartile mean with its interval."""
-        return estimate(self.returns)
+        """Their interquartile mean with its interval; of several tasks stratified, where all have as many runs."""
+        tasks: dict[str, list[float]] = {}
+        for run in self.runs:
+            tasks.setdefault(run.task, []).append(run.score.mean)
+        even = len({len(scores) for scores in tasks.values()}) == 1
+        return estimate(np.transpose(list(tasks.values())) if even and len(tasks) > 1 else self.returns)
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values."""
@@ -99,17 +109,19 @@ class GroupCurve:
     high: Floats | None
 
 
-def read_groups(paths: Sequence[str | Path]) -> tuple[list[Group], list[str]]:
+def read_groups(paths: Sequence[str | Path], by: str | None = None) -> tuple[list[Group], list[str]]:
     """The runs in these folders, grouped: the seeds of one sweep, and runs alike in all but their seed.
 
     Args:
         paths: run folders and sweep folders.
+        by: an option; then runs with the same value of it are one group, whatever else they differ in.
 
     Returns:
-        The groups in the order of the folders, and the runs left out, each with the reason.
+        The groups in the order of the folders, or of the option's values, and the runs left out, each with the reason.
 
     Raises:
         RunFolderError: if a folder holds neither a run nor a sweep, or no run has been evaluated.
+        ValueError: if no run has such an option.
     """
     gathered: dict[tuple[str, int], list[SeedRun]] = {}
     found: dict[tuple[str, int], tuple[str, dict[str, Any]]] = {}
@@ -129,10 +141,36 @@ def read_groups(paths: Sequence[str | Path]) -> tuple[list[Group], list[str]]:
             # A seed that comes again under one configuration is no further evidence: it stands in a group of its own.
             again = next(n for n in range(len(seen)) if run.seed not in {r.seed for r in gathered.get((words, n), [])})
             gathered.setdefault((words, again), []).append(run)
-            found.setdefault((words, again), (path.name, settings))
+            cell = folder.parent.name if folder.parent not in (path, path.parent) else path.name
+            found.setdefault((words, again), (cell, settings))
     if not gathered:
         raise RunFolderError("nothing to compare: " + "; ".join(left_out))
+    if by is not None:
+        return _by_option(by, [(found[key][1], runs) for key, runs in gathered.items()]), left_out
     return _named([(*found[key], tuple(runs)) for key, runs in gathered.items()]), left_out
+
+
+def _by_option(by: str, found: Sequence[tuple[dict[str, Any], list[SeedRun]]]) -> list[Group]:
+    """One group for each value of an option, smaller numbers first."""
+    wanted = re.sub(r"(^|\.)lambda$", r"\1lambda_", by.replace("-", "_"))
+    every = dict.fromkeys(name for settings, _ in found for name in settings)
+    names = [name for name in every if name == wanted or name.partition(".")[2] == wanted]
+    if not names:
+        differing = [name.rpartition(".")[2].rstrip("_") for name in _differing([settings for settings, _ in found])]
+        raise ValueError(f"no run has an option {by}; the runs differ in {', '.join(differing) or 'their seed alone'}")
+    groups: dict[str, tuple[Any, list[SeedRun]]] = {}
+    for settings, runs in found:
+        value = next((settings[name] for name in names if name in settings), None)
+        rest = json.dumps({n: v for n, v in settings.items() if n not in names}, sort_keys=True, default=str)
+        own = groups.setdefault(json.dumps(value, default=str), (value, []))
+        own[1].extend(dataclasses.replace(run, task=rest) for run in runs)
+    ordered = sorted(groups.values(), key=lambda one: _place_of(one[0]))
+    return [Group(f"{by} {value}", f"{by} {value}", {}, tuple(runs)) for value, runs in ordered]
+
+
+def _place_of(value: Any) -> tuple[bool, float, str]:
+    number = as_float(value)
+    return (math.isnan(number), 0.0 if math.isnan(number) else number, str(value))
 
 
 def _named(found: Sequence[tuple[str, dict[str, Any], tuple[SeedRun, ...]]]) -> list[Group]:
