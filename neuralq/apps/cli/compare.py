@@ -16,6 +16,7 @@ from neuralq.apps.cli import Failure, command_parser, print_result
 from neuralq.apps.cli.sweeps import refuse_other_kinds
 from neuralq.runs.evaluation import shown
 from neuralq.runs.report.comparison import Group, comparison_png, comparison_svg, read_groups
+from neuralq.runs.report.options import by_option, option_png, option_svg
 from neuralq.runs.report.page import format_value
 
 __all__ = ["compare"]
@@ -49,27 +50,33 @@ def compare(argv: list[str]) -> int:
     for reason in left_out:
         print(f"neuralq: left out: {reason}", file=sys.stderr)
     if out is not None:
-        _draw(groups, out)
+        _draw(groups, out, options.by)
     if not options.json:
         _print(groups, "seeds" if options.by is None else "runs")
     plain = {"groups": [group.plain() for group in groups], "left_out": left_out, "out": options.out}
-    print_result(plain, options.json, [] if out is None else [f"learning curves: {out}"])
+    drawn = "learning curves" if options.by is None else "picture"
+    print_result(plain, options.json, [] if out is None else [f"{drawn}: {out}"])
     return 0
 
 
 def _grouped(options: argparse.Namespace) -> tuple[list[Group], list[str]]:
+    groups, left_out = read_groups(options.runs)
+    if options.by is None:
+        return groups, left_out
     try:
-        return read_groups(options.runs, options.by)
+        return by_option(groups, options.by), left_out
     except ValueError as error:
         raise Failure(f"--by: {error}", 2) from error
 
 
-def _draw(groups: Sequence[Group], out: Path) -> None:
+def _draw(groups: Sequence[Group], out: Path, by: str | None) -> None:
+    """The learning curves of each group; by an option what the agents score at each of its values."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix.lower() == ".png":
-        out.write_bytes(comparison_png(groups))
+        out.write_bytes(comparison_png(groups) if by is None else option_png(groups, by))
     else:
-        out.write_text(comparison_svg(groups) + "\n", encoding="utf-8")
+        svg = comparison_svg(groups) if by is None else option_svg(groups, by)
+        out.write_text(svg + "\n", encoding="utf-8")
 
 
 def _print(groups: Sequence[Group], counted: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.numbers import any_number
 from neuralq.apps.cli.sweeps import run_to_the_end
 from neuralq.apps.cli.yaml_text import read_text
 from neuralq.runs.folder.run_folder import RunFolderError
@@ -40,6 +42,10 @@ def sweep(argv: list[str]) -> int:
     """Make the runs that a file asks for, or go on with them; or tell how far they are."""
     options = _parser().parse_args(argv)
     *file, folder = options.what
+    if len(file) > 1:
+        raise Failure(f"a file and a folder, two words at most, got {' '.join(options.what)}", 2)
+    if options.of is not None and options.index is None:
+        raise Failure("--of says how many shares there are; add --index, which one to make", 2)
     found = _asked_for(file[0], folder, options) if file else _there(folder)
     if options.status:
         return _status(found, options.json)
@@ -96,9 +102,19 @@ def _read(file: str) -> Asked:
     if not isinstance(content, dict):
         raise Failure(f"{file} must hold a mapping of options, got {type(content).__name__}", 2)
     try:
-        return read_asked(content)
+        return read_asked(_numbers(content))
     except ValueError as error:
         raise Failure(f"{file}: {error}", 2) from error
+
+
+def _numbers(value: Any) -> Any:
+    """With 100k and 2.5M, which YAML has no word for, as numbers."""
+    if isinstance(value, dict):
+        return {name: _numbers(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_numbers(inner) for inner in value]
+    is_written = isinstance(value, str) and re.fullmatch(r"[\d._]*\d[\d._]*[kKMG]", value, re.ASCII)
+    return any_number(value) if is_written else value
 
 
 def _there(folder: str) -> Sweep:

@@ -42,6 +42,7 @@ from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.runs.trust import refuse_strangers
 
 __all__ = [
+    "a_configuration",
     "add_trust",
     "add_which",
     "refuse_other_kinds",
@@ -109,6 +110,12 @@ def resume_seeds(
         parts = {CONTROL.full_name(first, name).rpartition(".")[2]: value for name, value in changes.items()}
     sweep = open_sweep(path, total_steps, parts)
     return run_to_the_end(sweep, LocalProcesses(num_workers, sweep.configuration(members[0])), as_json)
+
+
+def a_configuration(path: str | Path) -> dict[str, Any]:
+    """The configuration of the first run of a sweep."""
+    sweep = open_sweep(path)
+    return sweep.configuration(next(sweep.members()))
 
 
 def add_which(parser: argparse.ArgumentParser) -> None:
@@ -229,7 +236,7 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
             text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
         lines.append(text)
     if sweep.axes:
-        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes))}")
+        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes)).rstrip('_')}")
     return [*lines, f"sweep folder {sweep.path}"]
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,19 +107,17 @@ class GroupCurve:
     high: Floats | None
 
 
-def read_groups(paths: Sequence[str | Path], by: str | None = None) -> tuple[list[Group], list[str]]:
+def read_groups(paths: Sequence[str | Path]) -> tuple[list[Group], list[str]]:
     """The runs in these folders, grouped: the seeds of one sweep, and runs alike in all but their seed.
 
     Args:
         paths: run folders and sweep folders.
-        by: an option; then runs with the same value of it are one group, whatever else they differ in.
 
     Returns:
-        The groups in the order of the folders, or of the option's values, and the runs left out, each with the reason.
+        The groups in the order of the folders, and the runs left out, each with the reason.
 
     Raises:
         RunFolderError: if a folder holds neither a run nor a sweep, or no run has been evaluated.
-        ValueError: if no run has such an option.
     """
     gathered: dict[tuple[str, int], list[SeedRun]] = {}
     found: dict[tuple[str, int], tuple[str, dict[str, Any]]] = {}
@@ -145,32 +141,7 @@ def read_groups(paths: Sequence[str | Path], by: str | None = None) -> tuple[lis
             found.setdefault((words, again), (cell, settings))
     if not gathered:
         raise RunFolderError("nothing to compare: " + "; ".join(left_out))
-    if by is not None:
-        return _by_option(by, [(found[key][1], runs) for key, runs in gathered.items()]), left_out
     return _named([(*found[key], tuple(runs)) for key, runs in gathered.items()]), left_out
-
-
-def _by_option(by: str, found: Sequence[tuple[dict[str, Any], list[SeedRun]]]) -> list[Group]:
-    """One group for each value of an option, smaller numbers first."""
-    wanted = re.sub(r"(^|\.)lambda$", r"\1lambda_", by.replace("-", "_"))
-    every = dict.fromkeys(name for settings, _ in found for name in settings)
-    names = [name for name in every if name == wanted or name.partition(".")[2] == wanted]
-    if not names:
-        differing = [name.rpartition(".")[2].rstrip("_") for name in _differing([settings for settings, _ in found])]
-        raise ValueError(f"no run has an option {by}; the runs differ in {', '.join(differing) or 'their seed alone'}")
-    groups: dict[str, tuple[Any, list[SeedRun]]] = {}
-    for settings, runs in found:
-        value = next((settings[name] for name in names if name in settings), None)
-        rest = json.dumps({n: v for n, v in settings.items() if n not in names}, sort_keys=True, default=str)
-        own = groups.setdefault(json.dumps(value, default=str), (value, []))
-        own[1].extend(dataclasses.replace(run, task=rest) for run in runs)
-    ordered = sorted(groups.values(), key=lambda one: _place_of(one[0]))
-    return [Group(f"{by} {value}", f"{by} {value}", {}, tuple(runs)) for value, runs in ordered]
-
-
-def _place_of(value: Any) -> tuple[bool, float, str]:
-    number = as_float(value)
-    return (math.isnan(number), 0.0 if math.isnan(number) else number, str(value))
 
 
 def _named(found: Sequence[tuple[str, dict[str, Any], tuple[SeedRun, ...]]]) -> list[Group]:
@@ -289,7 +260,8 @@ def _paint(figure: Figure, groups: Sequence[Group]) -> None:
     for number, group in enumerate(groups):
         curve = group_curve(group)
         colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        seeds = f" ({len(group.runs)} seeds)" if len(group.runs) > 1 else f" (seed {group.runs[0].seed})"
+        counted = "seeds" if len({run.seed for run in group.runs}) == len(group.runs) else "runs"
+        seeds = f" ({len(group.runs)} {counted})" if len(group.runs) > 1 else f" (seed {group.runs[0].seed})"
         if curve.low is not None and curve.high is not None:
             band(axes, curve.steps, curve.low, curve.high, colour)
         every = max(1, len(curve.steps) // 12)
