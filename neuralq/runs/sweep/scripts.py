@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
+import yaml  # type: ignore[import-untyped]
 
 from neuralq.checks import check_whole
 
@@ -161,7 +161,7 @@ def kubernetes_job(
         "volumes": [{"name": "sweeps", "persistentVolumeClaim": {"claimName": claim}}],
     }
     head = f"# kubectl create -f THIS_FILE, when the folder {name!r} is at the root of the claim {claim!r}.\n"
-    return head + yaml.safe_dump(_job(shares, pod), sort_keys=False, width=120)
+    return head + str(yaml.safe_dump(_job(shares, pod), sort_keys=False, width=120))
 
 
 def _job(shares: int, pod: dict[str, Any]) -> dict[str, Any]:
