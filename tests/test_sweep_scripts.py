@@ -34,13 +34,13 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def perform(place: Path, job: str, told: bool = False) -> tuple[int, str]:
+def perform(place: Path, job: str, told: bool = False, restarts: int = 0, seconds: int = 0) -> tuple[int, str]:
     """The script's exit status and what it asked of ``scontrol``, where the command does ``job``."""
     root = place.parent
     (root / "job").write_text(job)
     (root / "script").write_text(slurm_script(place, 24))
     env = {**os.environ, "PATH": f"{root}:{os.environ['PATH']}", "SLURM_ARRAY_JOB_ID": "12", "SLURM_ARRAY_TASK_ID": "3"}
-    env |= {"SLURM_JOB_ID": "12"}
+    env |= {"SLURM_JOB_ID": "12", "SLURM_RESTART_COUNT": str(restarts), "SECONDS": str(seconds)}
     with subprocess.Popen(["bash", str(root / "script")], env=env, stdout=subprocess.PIPE) as process:
         if told:
             assert process.stdout is not None and process.stdout.readline() == b"ready\n"
@@ -71,6 +71,16 @@ def test_a_task_queues_again_when_work_is_left_and_only_then(
     place: Path, job: str, told: bool, status: int, asked: str
 ) -> None:
     assert perform(place, job, told) == (status, asked)
+
+
+def test_a_task_without_time_to_work_does_not_queue_for_ever(place: Path) -> None:
+    assert perform(place, "exit 75", restarts=2) == (75, "requeue 12_3\n")
+    (place.parent / "asked").unlink()
+    assert perform(place, "exit 75", restarts=3) == (75, "")
+    assert perform(place, "exit 75", restarts=3, seconds=60) == (75, "requeue 12_3\n")  # where bash begins to count
+    (place.parent / "asked").unlink()
+    (place.parent / "scontrol").unlink()
+    assert perform(place, "exit 75") == (75, "")  # where there is no scontrol
 
 
 def test_the_script_is_sound_and_its_words_arrive_whole(place: Path) -> None:

@@ -50,8 +50,9 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
     finished. A node that is lost, and a task that is preempted, are Slurm's to replace (``--requeue``). What the site
     wants beside it (``--time``, ``--partition``, ``--mem``) goes to ``sbatch``.
 
-    A task is named by its array and its index: the last task of an array has the number of the whole array, so that
-    its number alone would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
+    A task that is asked to end within a minute of its beginning queues again three times, not for ever. A task is named
+    by its array and its index: the last task of an array has the number of the whole array, so that its number alone
+    would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
 
     Args:
         path: of the sweep, where the nodes see it too.
@@ -93,12 +94,14 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
 #SBATCH --output="{log}"
 
 export OMP_NUM_THREADS={num_threads}
+
+# The shell hears that its time is up, the command does not: pass it on. A trap cuts "wait" short.
+asked=
+share=
+trap 'asked=yes; [ -z "$share" ] || kill -USR1 "$share" 2>/dev/null' USR1
 {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares} &
 share=$!
-
-# The shell hears of the end of its time, the command does not: pass it on. A trap cuts "wait" short.
-asked=
-trap 'asked=yes; kill -USR1 "$share" 2>/dev/null' USR1
+[ -z "$asked" ] || kill -USR1 "$share"
 wait "$share"
 while kill -0 "$share" 2>/dev/null; do wait "$share"; done
 wait "$share"
@@ -106,8 +109,11 @@ status=$?
 
 # {WORK_IS_LEFT}: saved, and work is left. Killed by USR1 itself: asked before it could listen, nothing lost.
 if [ "$status" = {WORK_IS_LEFT} ] || {{ [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }}; then
-  scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}" ||
-    echo "could not queue again; what is left is done by handing this script to sbatch once more" >&2
+  if [ "$SECONDS" -lt 60 ] && [ "${{SLURM_RESTART_COUNT:-0}}" -ge 3 ]; then
+    echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
+  elif ! scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; then
+    echo "could not be queued again: what is left is done by handing this script to sbatch once more" >&2
+  fi
 fi
 exit "$status"
 """
