@@ -27,10 +27,9 @@ from typing import Any
 
 from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs import RunConfig, evaluate_run, with_preset
-from neuralq.runs.children import python_command
 from neuralq.runs.folder.run_folder import read_metrics
 from neuralq.runs.recipe.config import config_to_dict
-from neuralq.runs.sweep import Sweep, create_sweep, num_cores, run_sweep
+from neuralq.runs.sweep import LocalProcesses, create_sweep, num_cores, run_sweep
 from neuralq.runs.sweep.statistics import estimate
 
 ENVS = ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")
@@ -49,20 +48,12 @@ def config_of(env: str, variant: str, num_steps: int | None) -> RunConfig:
     return with_preset({**given, "checkpoint_every": 10**9})
 
 
-def command(sweep: Sweep, seed: int) -> list[str]:
-    """Trains one seed in a process that stops with this one."""
-    config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
-    program = "from neuralq.apps.cli.sweeps import child; child()"
-    run = ["--seed", str(seed), "--run-dir", str(sweep.run_path(seed))]
-    return [*python_command(program), "train", *config, *run]
-
-
 def measure(env: str, variant: str, seeds: Sequence[int], options: argparse.Namespace) -> dict[str, Any]:
     config = config_of(env, variant, options.steps)
     with tempfile.TemporaryDirectory() as folder:
         sweep = create_sweep(Path(folder, "sweep"), config_to_dict(config), seeds)
         with sweep_bar(sweep) as bar:
-            result = run_sweep(sweep, command, min(options.workers, len(seeds)), bar)
+            result = run_sweep(sweep, LocalProcesses(min(options.workers, len(seeds)), sweep.config), bar)
         missing = [run for run in result.runs if run.state != "finished"]
         if missing:
             why = missing[0].reason or f"ended by {result.interrupted_by}"

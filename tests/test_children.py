@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from neuralq.apps.cli import main, sweeps
+from neuralq.apps.cli import main
 from neuralq.runs.children import python_command, safe_path
-from neuralq.runs.sweep import create_sweep
 
 PLANTED = "queue secrets selectors json argparse".split()
 
@@ -54,11 +53,6 @@ def test_the_workers_of_multiprocessing_begin_without_the_present_folder(beside:
     process.join()
     assert process.exitcode == 0 and not beside.exists()
     assert "PYTHONSAFEPATH" not in os.environ
-
-
-def test_every_seed_is_started_so(beside: Path, tmp_path: Path) -> None:
-    sweep = create_sweep(tmp_path / "sweep", {"env": "CartPole-v1", "total_steps": 10}, [3])
-    assert sweeps._command(sweep, 3)[:3] == [sys.executable, "-P", "-c"]
 
 
 def test_the_module_run_as_a_program_looks_into_the_present_folder_last(beside: Path) -> None:

@@ -27,7 +27,7 @@ from neuralq.runs.folder.files import FolderLock, RunFolderError, read_json, rea
 from neuralq.runs.folder.run_folder import RunFolder, read_config, read_metrics, read_seed, read_summary
 from neuralq.runs.hooks import WeightsAndBiases
 from neuralq.runs.report.page import Page
-from neuralq.runs.sweep import create_sweep, open_sweep, run_sweep
+from neuralq.runs.sweep import LocalProcesses, create_sweep, open_sweep, run_sweep
 from neuralq.runs.trust import refuse_strangers
 
 PRECIOUS = "what must not be touched\n"
@@ -146,9 +146,9 @@ def test_a_checkpoint_that_is_a_link_is_let_go_of_and_what_it_leads_to_stays(tmp
 
 def test_the_log_and_the_folder_of_a_seed_are_no_links(tmp_path: Path, precious: Path) -> None:
     sweep = create_sweep(tmp_path / "sweep", {"env": "CartPole-v1", "total_steps": 10}, [0, 1])
-    os.symlink(precious, sweep.log_path(0))
+    os.symlink(precious, sweep.path / "seed-0.log")
     os.symlink(precious.parent, sweep.run_path(1))
-    result = run_sweep(sweep, lambda sweep, seed: ["/bin/false"], 1)
+    result = run_sweep(sweep, LocalProcesses(1))
     assert [run.state for run in result.runs] == ["failed", "failed"]
     assert "seed-0.log is a link" in result.runs[0].reason and "seed-1 is a link" in result.runs[1].reason
     assert precious.read_text() == PRECIOUS and os.listdir(precious.parent) == ["precious"]

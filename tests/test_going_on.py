@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import neuralq
-from neuralq.apps.cli import main, sweeps
+from neuralq.apps.cli import main
 from neuralq.learners import RolloutSettings
 from neuralq.runs import Run, RunConfig, evaluate_run, load, resume, train
 from neuralq.runs.control import CONTROL
@@ -30,7 +30,7 @@ from neuralq.runs.folder import origin
 from neuralq.runs.folder.checkpoint import CheckpointError, load_newest
 from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, read_config, read_metrics
 from neuralq.runs.recipe.environments import make_envs
-from neuralq.runs.sweep import create_sweep
+from neuralq.runs.sweep import create_sweep, perform
 from neuralq_envs import CLASSIC
 
 GRID = RunConfig(
@@ -199,13 +199,17 @@ def test_a_run_moves_to_another_device_as_the_error_says(copy: Path, capsys: pyt
     assert "Traceback" not in captured.err
 
 
-def test_the_seeds_of_a_sweep_move_with_it(copy: Path, tmp_path: Path) -> None:
+def test_the_seeds_of_a_sweep_move_with_it(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = create_sweep(tmp_path / "sweep", {**read_config(copy), "device": "cuda:77"}, [0])
     shutil.copytree(copy, sweep.run_path(0))
     edited(sweep.run_path(0), device="cuda:77", stop_at_return=3.0)
     sweep.config["device"], sweep.config["stop_at_return"] = "cpu", None
-    words = sweeps._command(sweep, 0)
-    assert words[words.index("--total-steps") + 2 :] == ["--set=device=cpu", "--set=stop_at_return=none"]
+    asked = list[Any]()
+    monkeypatch.setattr(type(CONTROL), "resume", lambda kind, *words: asked.append(words))
+    perform(sweep.task(next(sweep.members())))
+    [(path, budget, _, changes)] = asked
+    assert (path, budget) == (sweep.run_path(0), sweep.config["total_steps"])
+    assert changes == {"device": "cpu", "stop_at_return": None}
 
 
 # Budgets and targets

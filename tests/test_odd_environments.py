@@ -14,9 +14,9 @@ import pytest
 from gymnasium import spaces
 
 from neuralq.apps.cli import main
-from neuralq.apps.cli.faults import explained, own_frame
 from neuralq.figures import draw_svg
 from neuralq.runs import RunConfig
+from neuralq.runs.faults import explained, own_frame
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.recipe import build
 from neuralq.systems.backgammon.opponents import IllegalTurn

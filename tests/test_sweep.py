@@ -20,64 +20,107 @@ from typing import Any
 
 import pytest
 
+from neuralq import with_preset
 from neuralq.apps.cli import main, sweeps
 from neuralq.apps.cli.sweeps import sweep_bar
-from neuralq.runs.folder.files import read_json
+from neuralq.runs.folder.files import FolderLock, read_json
 from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
-from neuralq.runs.sweep import Status, Sweep, create_sweep, is_sweep_folder, open_sweep, run_sweep
-from neuralq.runs.sweep import processes as processes_module
-
-CHILD = """
-import json, os, pathlib, signal, sys, time
-folder, seed, total, behaviour = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
-folder.mkdir(parents=True, exist_ok=True)
-(folder / "run.json").write_text(json.dumps({"format": "neuralq-run", "version": 1, "seed": seed}))
-with open(folder / "started", "a") as file:
-    file.write(os.environ["OMP_NUM_THREADS"] + chr(10))
-def end(steps, status=0, **more):
-    (folder / "metrics.jsonl").write_text(json.dumps({"kind": "train", "env_steps": steps}) + chr(10))
-    summary = {"env_steps": steps, "greedy_return": 10.0 * seed, "cpu_seconds": 1.0, "reached": None,
-               "interrupted_by": None, "parameters_sha256": "0" * 64, **more}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    sys.exit(status)
-if behaviour == "fail":
-    sys.stderr.write("a first line\\nneuralq: error: the world ended\\n")
-    sys.exit(1)
-if behaviour == "die":
-    os.kill(os.getpid(), signal.SIGKILL)
-if behaviour == "wait":
-    signal.signal(signal.SIGTERM, lambda *_: end(total // 2, 143, interrupted_by="SIGTERM"))
-    (folder / "metrics.jsonl").write_text(json.dumps({"kind": "train", "env_steps": total // 4}) + chr(10) + "{half")
-    time.sleep(60)
-if behaviour == "slow":
-    time.sleep(0.15)
-if behaviour == "miss":
-    end(total, 1, reached=False)
-if behaviour == "reach":
-    end(total // 5, reached=True)
-end(total)
-"""
+from neuralq.runs.recipe.config import config_to_dict
+from neuralq.runs.sweep import (
+    Asked,
+    Ended,
+    LocalProcesses,
+    Status,
+    Sweep,
+    Task,
+    ask,
+    create_sweep,
+    is_sweep_folder,
+    open_sweep,
+    read_asked,
+    run_sweep,
+    share_of,
+    state_of,
+)
+from neuralq.runs.sweep import engine as engine_module
+from neuralq.runs.sweep.states import forget_failure, note_failure
 
 CONFIG = {"env": "CartPole-v1", "total_steps": 1000, "threads": 1}
+ASKED = Asked({"env": "CartPole-v1", "total_steps": 1000}, {"gamma": [0.9, 0.99]}, (0, 1))
 
 
-class Children:
-    """The command of each seed, as `run_sweep` wants it."""
+class Pretender:
+    """An engine whose runs end at once, each as it is told to: by the number of its seed, or of the others.
 
-    def __init__(self, **behaviours: str) -> None:
-        self.behaviours = behaviours
+    "finish", "fail", "die", "miss" the target, "reach" it early, "vanish" without a word, "advance" once and vanish,
+    "wait" until the end is asked for.
+    """
+
+    title = "pretended"
+
+    def __init__(self, num_workers: int = 2, **behaviours: str) -> None:
+        self.num_workers, self.behaviours = num_workers, behaviours
         self.asked: list[int] = []
+        self.waiting: list[Task] = []
+        self.ended: list[Ended] = []
+        self.most = 0
 
-    def __call__(self, sweep: Sweep, seed: int) -> list[str]:
+    def has_room(self) -> bool:
+        return len(self.waiting) + len(self.ended) < self.num_workers
+
+    def start(self, task: Task) -> None:
+        seed, path, total = int(task.config["seed"]), task.path, int(task.config["total_steps"])
         self.asked.append(seed)
-        total = str(sweep.total_steps)
         behaviour = self.behaviours.get(f"s{seed}", self.behaviours.get("others", "finish"))
-        return [sys.executable, "-S", "-c", CHILD, str(sweep.run_path(seed)), str(seed), total, behaviour]
+        if behaviour == "refuse":
+            raise OSError("no room for a process")
+        path.mkdir(parents=True, exist_ok=True)
+        forget_failure(path)
+        (path / "run.json").write_text(json.dumps({"format": "neuralq-run", "version": 1, "seed": seed}))
+        reason = ""
+        if behaviour == "wait":
+            line = json.dumps({"kind": "train", "env_steps": total // 4}) + "\n{half"
+            (path / "metrics.jsonl").write_text(line)
+            self.waiting.append(task)
+            return
+        if behaviour == "fail":
+            note_failure(path, "the world ended")
+        elif behaviour == "die":
+            reason = "killed by SIGKILL"
+        elif behaviour == "advance":
+            step = 1000 * self.asked.count(seed)
+            (path / "checkpoints" / f"step-{step:012d}").mkdir(parents=True)
+            if step == 5000:
+                self.end(path, seed, total)
+        elif behaviour in ("miss", "reach"):
+            self.end(path, seed, total if behaviour == "miss" else total // 5, reached=behaviour == "reach")
+        elif behaviour != "vanish":
+            self.end(path, seed, total)
+        self.ended.append(Ended(task, reason))
 
+    def end(self, path: Path, seed: int, steps: int, **more: Any) -> None:
+        (path / "metrics.jsonl").write_text(json.dumps({"kind": "train", "env_steps": steps}) + "\n")
+        summary = {"env_steps": steps, "greedy_return": 10.0 * seed, "cpu_seconds": 1.0, "reached": None}
+        summary |= {"interrupted_by": None, "parameters_sha256": "0" * 64, **more}
+        (path / "summary.json").write_text(json.dumps(summary))
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes_module, "_POLL_SECONDS", 0.01)
+    def collect(self, seconds: float) -> list[Ended]:
+        self.most = max(self.most, len(self.running()))
+        ended, self.ended = self.ended, []
+        return ended
+
+    def running(self) -> list[Task]:
+        return [*self.waiting, *(one.task for one in self.ended)]
+
+    def stop(self) -> None:
+        for task in self.waiting:
+            seed, total = int(task.config["seed"]), int(task.config["total_steps"])
+            self.end(task.path, seed, total // 2, interrupted_by="SIGTERM")
+            self.ended.append(Ended(task))
+        self.waiting = []
+
+    def close(self) -> None:
+        self.waiting = []
 
 
 def a_sweep(tmp_path: Path, num_seeds: int = 4, **config: Any) -> Sweep:
@@ -85,9 +128,9 @@ def a_sweep(tmp_path: Path, num_seeds: int = 4, **config: Any) -> Sweep:
 
 
 def test_every_seed_runs_once_and_the_result_is_their_interquartile_mean(tmp_path: Path) -> None:
-    sweep, children, seen = a_sweep(tmp_path, 5), Children(others="slow"), list[Status]()
-    result = run_sweep(sweep, children, 2, seen.append)
-    assert children.asked == [0, 1, 2, 3, 4]
+    sweep, engine, seen = a_sweep(tmp_path, 5), Pretender(), list[Status]()
+    result = run_sweep(sweep, engine, seen.append)
+    assert engine.asked == [0, 1, 2, 3, 4] and engine.most == 2
     assert [run.state for run in result.runs] == ["finished"] * 5
     assert result.returns == [0.0, 10.0, 20.0, 30.0, 40.0]
     plain = result.plain()
@@ -95,28 +138,32 @@ def test_every_seed_runs_once_and_the_result_is_their_interquartile_mean(tmp_pat
     assert plain["low"] < 20.0 < plain["high"] and plain["num_finished"] == 5
     assert plain["runs"][3]["seed"] == 3 and plain["runs"][3]["env_steps"] == 1000
     assert read_json(sweep.path / "summary.json") == plain
-    assert max(len(status.running) for status in seen) == 2
     assert (seen[-1].env_steps, seen[-1].total_steps, seen[-1].num_finished) == (5000, 5000, 5)
-    assert seen[-1].returns == (0.0, 10.0, 20.0, 30.0, 40.0)
+    assert seen[-1].returns == {f"seed-{seed}": 10.0 * seed for seed in range(5)}
 
 
 def test_a_seed_that_fails_is_named_with_its_reason_and_the_others_go_on(tmp_path: Path) -> None:
-    sweep = a_sweep(tmp_path)
-    result = run_sweep(sweep, Children(s1="fail", s2="die"), 2)
-    assert [run.state for run in result.runs] == ["finished", "failed", "failed", "finished"]
-    assert [run.reason for run in result.runs] == ["", "the world ended", "killed by SIGKILL", ""]
-    assert result.returns == [0.0, 30.0] and result.plain()["num_failed"] == 2
+    sweep, engine = a_sweep(tmp_path, 5), Pretender(s1="fail", s2="die", s3="vanish", s4="refuse")
+    result = run_sweep(sweep, engine)
+    assert [run.state for run in result.runs] == ["finished", "failed", "failed", "failed", "failed"]
+    assert [run.reason for run in result.runs] == [
+        "", "the world ended", "killed by SIGKILL, 3 times over", "it ended before its end, 3 times over",
+        "no room for a process",
+    ]  # fmt: skip
+    assert [engine.asked.count(seed) for seed in range(5)] == [1, 1, 3, 3, 1]
+    assert [state_of(sweep.run_path(seed)).reason for seed in range(5)] == [run.reason for run in result.runs]
+    assert result.returns == [0.0] and result.plain()["num_failed"] == 4
 
 
-def test_a_program_that_cannot_be_started_is_a_failed_seed(tmp_path: Path) -> None:
-    result = run_sweep(a_sweep(tmp_path, 2), lambda sweep, seed: [str(tmp_path / "nothing")], 1)
-    assert all(run.state == "failed" and "nothing" in run.reason for run in result.runs)
-    assert result.plain()["iqm"] is None
+def test_a_run_that_dies_and_has_come_further_each_time_is_begun_again(tmp_path: Path) -> None:
+    engine = Pretender(others="advance")
+    assert [run.state for run in run_sweep(a_sweep(tmp_path, 1), engine).runs] == ["finished"]
+    assert engine.asked == [0] * 5
 
 
 def test_a_missed_target_is_no_failure_and_a_reached_one_ends_a_seed_early(tmp_path: Path) -> None:
     seen = list[Status]()
-    result = run_sweep(a_sweep(tmp_path, 2, stop_at_return=475), Children(s0="miss", s1="reach"), 2, seen.append)
+    result = run_sweep(a_sweep(tmp_path, 2, stop_at_return=475), Pretender(s0="miss", s1="reach"), seen.append)
     assert [run.state for run in result.runs] == ["finished", "finished"]
     assert [run.summary["env_steps"] for run in result.runs] == [1000, 200]
     assert seen[-1].env_steps == 2000, "a seed that ended early counts whole"
@@ -125,55 +172,46 @@ def test_a_missed_target_is_no_failure_and_a_reached_one_ends_a_seed_early(tmp_p
 
 def test_a_sweep_goes_on_where_it_stands(tmp_path: Path) -> None:
     sweep = a_sweep(tmp_path)
-    run_sweep(sweep, Children(s1="fail", s2="die"), 2)
-    children = Children()
-    assert [run.state for run in run_sweep(open_sweep(sweep.path), children, 2).runs] == ["finished"] * 4
-    assert children.asked == [1, 2], "finished seeds are left alone"
-    none = Children()
-    assert len(run_sweep(open_sweep(sweep.path), none, 2).returns) == 4 and none.asked == []
-    more = Children()
-    result = run_sweep(open_sweep(sweep.path, 2000), more, 2)
+    run_sweep(sweep, Pretender(s1="fail", s2="die"))
+    left = Pretender()
+    assert run_sweep(open_sweep(sweep.path), left, retry_failed=False).plain()["num_failed"] == 2 and left.asked == []
+    again = Pretender()
+    assert [run.state for run in run_sweep(open_sweep(sweep.path), again).runs] == ["finished"] * 4
+    assert again.asked == [1, 2], "finished seeds are left alone"
+    none = Pretender()
+    assert len(run_sweep(open_sweep(sweep.path), none).returns) == 4 and none.asked == []
+    more = Pretender()
+    result = run_sweep(open_sweep(sweep.path, 2000), more)
     assert more.asked == [0, 1, 2, 3] and {run.summary["env_steps"] for run in result.runs} == {2000}
-    assert open_sweep(sweep.path).total_steps == 2000
+    assert open_sweep(sweep.path).config["total_steps"] == 2000
 
 
 def test_a_signal_is_passed_on_and_the_sweep_resumes(tmp_path: Path) -> None:
     sweep, steps = a_sweep(tmp_path, 3), []
 
     def watch(status: Status) -> None:
-        begun = [sweep.run_path(seed) / "metrics.jsonl" for seed in (0, 1)]
-        if len(status.running) == 2 and all(file.exists() and file.stat().st_size for file in begun):
-            steps.append(status.env_steps)
-            if len(steps) == 2:
-                os.kill(os.getpid(), signal.SIGTERM)
+        steps.append(status.env_steps)
+        os.kill(os.getpid(), signal.SIGTERM)
 
     before = signal.getsignal(signal.SIGTERM)
-    result = run_sweep(sweep, Children(others="wait"), 2, watch)
+    result = run_sweep(sweep, Pretender(others="wait"), lambda status: watch(status) if not steps else None)
     assert signal.getsignal(signal.SIGTERM) is before
     assert result.interrupted_by == "SIGTERM"
     assert [run.state for run in result.runs] == ["stopped"] * 3 and result.returns == []
-    assert 500 in steps, "two seeds at a quarter of 1000 steps; the half-written line is passed over"
+    assert steps == [500], "two seeds at a quarter of 1000 steps; the half-written line is passed over"
     assert read_summary(sweep.run_path(0))["interrupted_by"] == "SIGTERM"
     assert not sweep.run_path(2).exists(), "nothing new is begun"
-    children = Children()
-    assert len(run_sweep(sweep, children, 2).returns) == 3 and children.asked == [0, 1, 2]
+    engine = Pretender()
+    assert len(run_sweep(sweep, engine).returns) == 3 and engine.asked == [0, 1, 2]
 
 
 def test_asked_twice_it_ends_at_once(tmp_path: Path) -> None:
     def watch(status: Status) -> None:
         os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        run_sweep(
-            a_sweep(tmp_path, 1), lambda *_: [sys.executable, "-S", "-c", "import time; time.sleep(60)"], 1, watch
-        )
-
-
-def test_children_get_the_threads_of_the_configuration(tmp_path: Path) -> None:
-    for threads in (1, 3):
-        sweep = a_sweep(tmp_path / str(threads), 1, threads=threads)
-        run_sweep(sweep, Children())
-        assert (sweep.run_path(0) / "started").read_text() == f"{threads}\n"
+        run_sweep(a_sweep(tmp_path, 1), Pretender(others="wait"), watch)
 
 
 def test_one_process_runs_a_sweep(tmp_path: Path) -> None:
@@ -181,31 +219,114 @@ def test_one_process_runs_a_sweep(tmp_path: Path) -> None:
 
     def watch(status: Status) -> None:
         with pytest.raises(RunFolderBusy, match=f"the sweep in {sweep.path} is being run by process {os.getpid()}"):
-            run_sweep(sweep, Children())
+            run_sweep(sweep, Pretender())
 
-    assert len(run_sweep(sweep, Children(), 1, watch).returns) == 1
+    assert len(run_sweep(sweep, Pretender(), watch).returns) == 1
 
 
-def test_children_stop_when_their_parent_is_killed(tmp_path: Path) -> None:
-    child = (
-        "import pathlib, signal, sys, time; from neuralq.runs.sweep import stop_with_parent; stop_with_parent();"
-        "place = pathlib.Path(sys.argv[1]);"
-        "signal.signal(signal.SIGTERM, lambda *_: (place.with_suffix('.stopped').touch(), sys.exit(0)));"
-        "place.with_suffix('.begun').touch(); time.sleep(60)"
+def test_a_run_that_another_process_is_at_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_module, "_ELSEWHERE_SECONDS", 0.0)
+    sweep, engine, looks = a_sweep(tmp_path, 2), Pretender(), list[Status]()
+    sweep.run_path(0).mkdir(parents=True)
+    lock = FolderLock(sweep.run_path(0) / "run.lock", "busy")
+    assert sweep.state(next(sweep.members())).state == "running"
+
+    def watch(status: Status) -> None:
+        looks.append(status)
+        assert engine.asked == [1] or len(looks) > 1
+        lock.close()
+
+    assert [run.state for run in run_sweep(sweep, engine, watch).runs] == ["finished"] * 2
+    assert engine.asked == [1, 0] and sweep.state(next(sweep.members())).state == "finished"
+
+
+def test_shares_divide_a_sweep(tmp_path: Path) -> None:
+    sweep = ask(tmp_path / "sweep", ASKED)
+    shares = [[member.name for member in share_of(sweep, index, 3)] for index in range(3)]
+    assert (
+        sorted(name for share in shares for name in share) == sorted(member.name for member in sweep.members())
+        and len(shares[0]) == 2
     )
-    parent = (
-        "import sys; from neuralq.runs.sweep import *\n"
-        f"sweep = create_sweep(sys.argv[1], {CONFIG!r}, range(1))\n"
-        f"run_sweep(sweep, lambda sweep, seed: [sys.executable, '-c', {child!r}, sys.argv[2]], 1)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", parent, str(tmp_path / "sweep"), str(tmp_path / "child")])
-    try:
-        wait_for(tmp_path / "child.begun")
-    finally:
-        process.kill()
-        process.wait()
-    wait_for(tmp_path / "child.stopped")
-    assert run_sweep(open_sweep(tmp_path / "sweep"), Children()).returns == [0.0], "and the lock is free"
+    engine = Pretender()
+    result = run_sweep(sweep, engine, members=share_of(sweep, 1, 3))
+    assert len(result.runs) == 1 and not (sweep.path / "summary.json").exists(), "that is of the whole"
+    for index, of in ((3, 3), (-1, 3), (0, 0)):
+        with pytest.raises(ValueError, match="shares 0 to"):
+            share_of(sweep, index, of)
+
+
+def test_values_and_seeds_are_added_and_nothing_is_made_again(tmp_path: Path) -> None:
+    sweep, engine = ask(tmp_path / "sweep", ASKED), Pretender()
+    run_sweep(sweep, engine)
+    assert engine.asked == [0, 0, 1, 1] and len(sweep) == 4
+    more = ask(sweep.path, Asked(ASKED.base, {"gamma": [0.99, 0.95]}, (2, 0)))
+    assert more.axes == {"gamma": [0.9, 0.99, 0.95]} and more.seeds == (0, 1, 2)
+    again = Pretender()
+    assert len(run_sweep(more, again).runs) == 9 and again.asked == [0, 1, 2, 2, 2]
+    assert open_sweep(sweep.path).asked == more.asked
+    for base, axes, named in (
+        ({**ASKED.base, "total_steps": 7}, ASKED.axes, "total_steps: 1000 there, 7 here"),
+        (ASKED.base, {}, r"gamma: \[0.9, 0.99, 0.95\] there, 'nothing' here"),
+        (ASKED.base, {**ASKED.axes, "seed": [1]}, "seed"),
+    ):
+        with pytest.raises(RunFolderError, match=named):
+            ask(sweep.path, Asked(base, axes, (0,)))
+
+
+def test_each_run_gets_its_options_over_the_preset_of_its_environment(tmp_path: Path) -> None:
+    base = {"env": "CartPole-v1", "total_steps": 1000, "hidden": "8", "learning_rate": 0.5}
+    sweep = ask(tmp_path / "sweep", Asked({**base, "hidden": [8]}, {"lambda_": [0.1, 0.2]}, (3,)))
+    tasks = [sweep.task(member) for member in sweep.members()]
+    assert [task.config["rollout"]["lambda_"] for task in tasks] == [0.1, 0.2]
+    assert {task.config["seed"] for task in tasks} == {3}
+    assert {task.config["rollout"]["learning_rate"] for task in tasks} == {0.5}
+    given = {"total_steps": 1000, "hidden": [8], "seed": 3, "learning_rate": 0.5, "lambda_": 0.1}
+    assert tasks[0].config == json.loads(json.dumps(config_to_dict(with_preset("CartPole-v1", **given))))
+    assert tasks[0].path == sweep.path / tasks[0].name and tasks[0].log_path.name == "seed-3.log"
+    with pytest.raises(ValueError, match=r"gamma.*\(with gamma 2\)"):
+        ask(tmp_path / "other", Asked({"env": "CartPole-v1"}, {"gamma": [0.5, 2]}, (0,)))
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "values"),
+    [
+        ({"from": 4, "to": 16, "step": 4}, [4, 8, 12, 16]),
+        ({"from": 1, "to": 3}, [1, 2, 3]),
+        ({"from": 3, "to": 1, "step": -1}, [3, 2, 1]),
+        ({"from": 0.5, "to": 0.9, "count": 3}, [0.5, 0.7, 0.9]),
+        ({"from": 1e-4, "to": 1e-2, "count": 3, "scale": "log"}, [1e-4, 1e-3, 1e-2]),
+        ({"from": 0.1, "to": 0.3, "step": 0.1}, [0.1, 0.2, 0.3]),
+        ([[64, 64], [32]], [[64, 64], [32]]),
+    ],
+)
+def test_lists_and_ranges_are_axes(value: Any, values: list[Any]) -> None:
+    asked = read_asked({"env": "X-v0", "rollout": {"some": value}, "gamma": 0.9, "seeds": {"from": 3, "to": 5}})
+    assert asked.axes == {"some": values} and asked.base == {"env": "X-v0", "gamma": 0.9}
+    assert asked.seeds == (3, 4, 5) and asked.num_cells == len(values)
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ({"gamma": []}, "gamma needs one value or more"),
+        ({"gamma": [0.9, 0.9]}, "each named once"),
+        ({"gamma": {"from": 1, "to": 2, "scale": "log", "count": 0}}, "count of gamma"),
+        ({"gamma": {"from": 0, "to": 2, "scale": "log", "count": 3}}, "lies above 0"),
+        ({"gamma": {"from": 0.1, "to": 0.2}}, "must be a range like"),
+        ({"gamma": {"from": 1, "to": 2, "step": -1}}, "must be a range like"),
+        ({"gamma": {"from": 1, "to": 2, "step": 0}}, "must be a range like"),
+        ({"gamma": {"from": "a", "to": 2}}, "must be a range like"),
+        ({"gamma": 1, "seeds": 0}, "seeds"),
+        ({"gamma": 1, "seeds": [1, 1]}, "each named once"),
+        ({"gamma": 1, "seed": 1, "seeds": 2}, "seed and seeds"),
+        ({"lambda": 1, "lambda_": 1}, "lambda_ is given twice"),
+        ({"a": {"from": 1, "to": 10_000}, "b": {"from": 1, "to": 10_000}}, "at most 10,000,000 runs"),
+    ],
+)
+def test_what_no_sweep_can_be_is_refused_by_its_name(content: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        read_asked({"env": "X-v0", **content})
 
 
 def wait_for(path: Path) -> None:
@@ -220,7 +341,7 @@ def test_what_is_no_new_sweep_is_refused(tmp_path: Path) -> None:
     assert is_sweep_folder(sweep.path) and not is_sweep_folder(tmp_path)
     with pytest.raises(RunFolderError, match=f"already holds a sweep; continue it with `neuralq resume {sweep.path}`"):
         create_sweep(sweep.path, CONFIG, [0])
-    run_sweep(sweep, Children())
+    run_sweep(sweep, Pretender())
     with pytest.raises(RunFolderError, match="already holds a run"):
         create_sweep(sweep.run_path(0), CONFIG, [0])
     for seeds in ([], [1, 1]):
@@ -229,7 +350,7 @@ def test_what_is_no_new_sweep_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number"):
         create_sweep(tmp_path / "other", CONFIG, [-1])
     with pytest.raises(ValueError, match="num_workers"):
-        run_sweep(sweep, Children(), 0)
+        LocalProcesses(0)
     with pytest.raises(RunFolderError, match="no sweep in"):
         open_sweep(tmp_path)
     for damage in ("{", "{}", '{"format": "other", "version": 1, "seeds": [], "options": []}'):
@@ -240,18 +361,18 @@ def test_what_is_no_new_sweep_is_refused(tmp_path: Path) -> None:
 
 def test_a_seed_stopped_at_its_last_step_has_not_finished(tmp_path: Path) -> None:
     sweep = a_sweep(tmp_path, 1)
-    run_sweep(sweep, Children())
+    run_sweep(sweep, Pretender())
     summary = read_summary(sweep.run_path(0))
     (sweep.run_path(0) / "summary.json").write_text(json.dumps({**summary, "interrupted_by": "SIGTERM"}))
-    children = Children()
-    assert len(run_sweep(sweep, children).returns) == 1 and children.asked == [0], "its last evaluation was missing"
+    engine = Pretender()
+    assert len(run_sweep(sweep, engine).returns) == 1 and engine.asked == [0], "its last evaluation was missing"
 
 
 def test_a_damaged_summary_is_a_seed_that_has_not_finished(tmp_path: Path) -> None:
     sweep = a_sweep(tmp_path, 1)
-    run_sweep(sweep, Children())
+    run_sweep(sweep, Pretender())
     (sweep.run_path(0) / "summary.json").write_text("{")
-    assert run_sweep(sweep, Children()).returns == [0.0]
+    assert run_sweep(sweep, Pretender()).returns == [0.0]
 
 
 # The command line.
@@ -261,10 +382,10 @@ def test_lines_for_people_and_their_pace(tmp_path: Path) -> None:
     out, now = io.StringIO(), [0.0]
     with sweep_bar(a_sweep(tmp_path, 3), out, lambda: now[0]) as bar:
         for second, status in (
-            (0, Status(0, 3000, (0, 1), 0, (), ())),
-            (5, Status(500, 3000, (0, 1), 0, (), ())),
-            (11, Status(1100, 3000, (0, 1), 0, (), ())),
-            (12, Status(2000, 3000, (2,), 1, (1,), (50.0,))),
+            (0, Status(0, 3000, ("seed-0", "seed-1"), 0, (), {})),
+            (5, Status(500, 3000, ("seed-0", "seed-1"), 0, (), {})),
+            (11, Status(1100, 3000, ("seed-0", "seed-1"), 0, (), {})),
+            (12, Status(2000, 3000, ("seed-2",), 1, ("seed-1",), {"seed-0": 50.0})),
         ):
             now[0] = float(second)
             bar(status)
@@ -281,7 +402,7 @@ def test_the_command_names_what_failed_and_resumes_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "sweep"
-    monkeypatch.setattr(sweeps, "_command", Children(s3="fail"))
+    monkeypatch.setattr(sweeps, "LocalProcesses", lambda *_: Pretender(s3="fail"))
     assert main([*TRAIN, "--run-dir", str(path)]) == 1
     captured = capsys.readouterr()
     assert f"seed 3: failed: the world ended (see {path}/seed-3.log)" in captured.out
@@ -289,7 +410,7 @@ def test_the_command_names_what_failed_and_resumes_it(
     assert f"seed 3 failed, try again with: neuralq resume {path}" in captured.err.splitlines()[-1]
     assert main([*TRAIN, "--run-dir", str(path)]) == 1
     assert "already holds a sweep" in capsys.readouterr().err
-    monkeypatch.setattr(sweeps, "_command", Children())
+    monkeypatch.setattr(sweeps, "LocalProcesses", lambda *_: Pretender())
     assert main(["resume", str(path), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["iqm"] == 30.0 and [run["seed"] for run in result["runs"]] == [2, 3, 4]
@@ -299,7 +420,7 @@ def test_the_command_names_what_failed_and_resumes_it(
 def test_the_command_says_which_seeds_missed_the_target(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sweeps, "_command", Children(s2="miss", others="reach"))
+    monkeypatch.setattr(sweeps, "LocalProcesses", lambda *_: Pretender(s2="miss", others="reach"))
     assert main([*TRAIN, "--stop-at-return", "475", "--run-dir", str(tmp_path / "sweep")]) == 1
     assert "the target of 475 was not reached by 1 seeds: 2" in capsys.readouterr().err
 
@@ -316,17 +437,6 @@ def test_the_command_says_which_seeds_missed_the_target(
 def test_wrong_usage_is_refused(argv: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == 2
     assert said in capsys.readouterr().err
-
-
-def test_the_words_of_the_command_line_reach_each_seed(tmp_path: Path) -> None:
-    sweep = create_sweep(tmp_path / "sweep", CONFIG, [7], ["--tensorboard"])
-    words = sweeps._command(open_sweep(sweep.path), 7)
-    assert words[4:7] == ["train", "--config", str(sweep.path / "config.json")]
-    assert words[words.index("--seed") + 1] == "7" and words[-1] == "--tensorboard"
-    assert words[words.index("--run-dir") + 1] == str(sweep.path / "seed-7")
-    run_sweep(sweep, Children())
-    words = sweeps._command(sweep, 7)
-    assert words[4:] == ["resume", str(sweep.path / "seed-7"), "--total-steps", "1000"]
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuralq.apps.cli import main, sweeps
+from neuralq.apps.cli import main
 from neuralq.learners import ReplaySettings, RolloutSettings
 from neuralq.q import MLP
 from neuralq.runs import RunConfig, load, resume, train
@@ -24,8 +24,7 @@ from neuralq.runs.folder.checkpoint import load_newest
 from neuralq.runs.folder.run_folder import read_metrics, read_summary
 from neuralq.runs.loop import HookFault
 from neuralq.runs.recipe.config import config_to_dict
-from neuralq.runs.sweep import create_sweep, open_sweep
-from neuralq.runs.sweep.folder import has_finished
+from neuralq.runs.sweep import create_sweep
 
 
 def configuration(**given: Any) -> RunConfig:
@@ -226,8 +225,8 @@ def test_several_hooks_from_the_shell_stop_a_run_and_seeds_of_a_sweep(
     assert status == 1 and f"was not reached before {told}, after 32 steps" in capsys.readouterr().err
     sweep = create_sweep("sweep", config_to_dict(RunConfig()), [0], words[-4:])
     Path("run").rename(sweep.run_path(0))
-    assert has_finished(open_sweep("sweep"), 0)
-    assert sweeps._command(sweep, 0)[-4:] == words[-4:]
+    member = next(sweep.members())
+    assert sweep.state(member).state == "finished" and sweep.task(member).options == tuple(words[-4:])
 
 
 @pytest.mark.whole

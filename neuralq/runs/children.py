@@ -10,11 +10,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-__all__ = ["python_command", "safe_path"]
+__all__ = ["python_command", "safe_path", "with_environment", "without_main"]
 
 _SEARCH = """import sys
 own, last = {own!r}, {last!r}
@@ -38,6 +39,29 @@ def python_command(code: str) -> list[str]:
 
 
 @contextlib.contextmanager
+def with_environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Processes that are started in the block find these variables in their environment.
+
+    Example:
+        >>> with with_environment({"NEURALQ_EXAMPLE": "1"}):
+        ...     os.environ["NEURALQ_EXAMPLE"]
+        '1'
+        >>> "NEURALQ_EXAMPLE" in os.environ
+        False
+    """
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
 def safe_path() -> Iterator[None]:
     """Processes that are started in the block, by `multiprocessing` too, do not begin with the present folder.
 
@@ -46,12 +70,18 @@ def safe_path() -> Iterator[None]:
         ...     os.environ["PYTHONSAFEPATH"]
         '1'
     """
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
+    with with_environment({"PYTHONSAFEPATH": "1"}):
+        yield
+
+
+@contextlib.contextmanager
+def without_main() -> Iterator[None]:
+    """Processes started in the block by `multiprocessing` do not run the program's main file again, which trains."""
+    main: Any = sys.modules["__main__"]
+    kept = {name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__}
+    main.__dict__.pop("__file__", None)
+    main.__spec__ = None
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop("PYTHONSAFEPATH", None)
-        else:
-            os.environ["PYTHONSAFEPATH"] = before
+        main.__dict__.update(kept)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 from neuralq.checks import MissingExtra, check_module_name
 from neuralq.runs.folder.files import write_durably
+from neuralq.runs.recipe.config import RunConfig, config_to_dict
 from neuralq.runs.watching import EVENTS, Hook
 
-__all__ = ["TensorBoard", "WeightsAndBiases", "own_hook"]
+__all__ = ["TensorBoard", "WeightsAndBiases", "own_hook", "watching_hooks"]
 
 
 class TensorBoard:
@@ -133,3 +136,44 @@ class WeightsAndBiases:
     def close(self) -> None:
         """Send what is left and end the record."""
         self._run.finish()
+
+
+@contextlib.contextmanager
+def watching_hooks(
+    path: Path,
+    config: RunConfig,
+    tensorboard: bool = False,
+    wandb: bool = False,
+    own: Sequence[str] = (),
+    say: Callable[[str], None] = print,
+) -> Iterator[list[Hook]]:
+    """The hooks of a run in the order of what was asked for; closed at the end where they can be.
+
+    Args:
+        path: the run folder.
+        config: of the run.
+        tensorboard: whether to write event files.
+        wandb: whether to log to Weights & Biases.
+        own: hooks of the user's own, as for `own_hook`.
+        say: is told where closing a hook fails: the run is whole whatever that raises.
+    """
+    wanted: list[Callable[[], Hook]] = []
+    if tensorboard:
+        wanted.append(lambda: TensorBoard(path / "tensorboard"))
+    if wandb:
+        wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
+    wanted += [functools.partial(own_hook, name, config) for name in own]
+    with contextlib.ExitStack() as stack:
+        hooks: list[Hook] = []
+        for make in wanted:
+            hooks.append(make())
+            if callable(close := getattr(hooks[-1], "close", None)):
+                stack.callback(_end, close, hooks[-1], say)
+        yield hooks
+
+
+def _end(close: Callable[[], object], hook: Hook, say: Callable[[str], None]) -> None:
+    try:
+        close()
+    except Exception as error:
+        say(f"the hook {type(hook).__qualname__} raised {type(error).__name__} when it was closed: {error}")

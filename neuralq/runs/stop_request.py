@@ -1,4 +1,7 @@
-"""SIGTERM, SIGINT and SIGHUP as a request, so that whatever goes on can save before it ends."""
+"""SIGTERM, SIGINT, SIGHUP and SIGUSR1 as a request, so that whatever goes on can save before it ends.
+
+Schedulers send SIGUSR1 before the time that they allow is over.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from types import FrameType
 
 __all__ = ["StopAsked", "StopRequest", "pass_on", "raise_if_asked"]
 
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
 _FROM_A_HOOK = "a hook"
 _listening: list[StopRequest] = []
 _abandonable: list[StopRequest] = []

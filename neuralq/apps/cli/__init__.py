@@ -61,6 +61,7 @@ COMMANDS = {
     "train": _of("runs", "train", "train on a Gymnasium environment, or td-gammon, by TD(λ)", _LOOK),
     "resume": _of("runs", "resume", "go on with a run that was stopped or killed", _LOOK),
     "evaluate": _of("runs", "evaluate", "play greedy episodes with a trained run", _LOOK),
+    "sweep": _of("sweep", "sweep", "a run for every combination of options and seed, here or on a cluster", _LOOK),
     "report": _of("runs", "report", "write a run's report.html", _LOOK),
     "compare": _of("compare", "compare", "table and plot of several runs or sweeps side by side", _LOOK),
     "presets": _of("presets", "presets", "an overview of tuned settings, or one of them whole", _LOOK),
@@ -278,7 +279,7 @@ def _main(argv: Sequence[str] | None) -> int:
         print("neuralq: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        from neuralq.apps.cli.faults import explained
+        from neuralq.runs.faults import explained
 
         lines = explained(error)
         if lines is None:

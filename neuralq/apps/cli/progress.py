@@ -6,15 +6,17 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TextIO, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Column
+from rich.table import Column, Table
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from neuralq.runs.kinds import Kind
 
 __all__ = ["ProgressBar", "Told", "training_bar"]
@@ -29,6 +31,15 @@ _WIDE = 100
 T = TypeVar("T")
 
 
+class _BarAndTable(Progress):
+    table: Table | None = None
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield from super().get_renderables()
+        if self.table is not None and self.table.row_count:
+            yield self.table
+
+
 class Told(NamedTuple):
     """What is said of one report.
 
@@ -37,12 +48,14 @@ class Told(NamedTuple):
         parts: what stands beside the bar.
         amount: how much in words, which stands before the parts where there is no bar.
         event: where it changes from 0, or from what it was, a line is due at once.
+        total: of how much, where that is not known before.
     """
 
     so_far: int
     parts: Sequence[str]
     amount: str = ""
     event: int = 0
+    total: int | None = None
 
 
 class ProgressBar(Generic[T]):
@@ -53,6 +66,7 @@ class ProgressBar(Generic[T]):
         tell: what to say of a report.
         stream: where to draw; standard error by default, so that standard output stays clean.
         clock: tells the time in seconds.
+        below: of a report, the table that stands below the bar; None for none.
 
     Example:
         >>> import io
@@ -69,14 +83,15 @@ class ProgressBar(Generic[T]):
         tell: Callable[[T], Told],
         stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
+        below: Callable[[T], Table] | None = None,
     ) -> None:
-        self._tell, self._clock = tell, clock
+        self._tell, self._clock, self._below = tell, clock, below
         # Not as a notebook: that would draw nothing where there is no terminal, as here.
         self._console = Console(file=stream or sys.stderr, force_jupyter=False)
         in_notebook = "ipykernel" in sys.modules
         self._quiet = _NOTEBOOK_SECONDS if in_notebook else _QUIET_SECONDS
         self._said = (-math.inf if in_notebook else clock(), 0)
-        self._bar = Progress(
+        self._bar = _BarAndTable(
             BarColumn(bar_width=24 if self._console.width >= _WIDE else 8),
             MofNCompleteColumn(),
             TimeRemainingColumn(compact=True),
@@ -112,7 +127,9 @@ class ProgressBar(Generic[T]):
         told, now = self._tell(report), self._clock()
         narrow = self._console.width < _WIDE  # what is said last matters most, and is not to be what is left out
         parts = reversed(told.parts) if narrow else told.parts
-        self._bar.update(self._task, completed=told.so_far, text=" · ".join(parts))
+        self._bar.update(self._task, completed=told.so_far, text=" · ".join(parts), total=told.total)
+        if self._below is not None and self._console.is_terminal:
+            self._bar.table = self._below(report)
         if not self._console.is_terminal and (now - self._said[0] > self._quiet or told.event != self._said[1]):
             self._said = (now, told.event)
             line = " · ".join(filter(None, (told.amount, *told.parts)))

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import functools
 import importlib
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,7 @@ from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
 from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
-from neuralq.runs import Run, RunConfig, evaluate_run, load
+from neuralq.runs import Run, evaluate_run, load
 from neuralq.runs.changes import told
 from neuralq.runs.control import CONTROL, agent_of, last_cap
 from neuralq.runs.estimate import estimate_policy
@@ -33,11 +30,10 @@ from neuralq.runs.folder.run_folder import (
     read_metrics,
     refuse_old_run,
 )
-from neuralq.runs.hooks import TensorBoard, WeightsAndBiases, own_hook
+from neuralq.runs.hooks import watching_hooks
 from neuralq.runs.kinds import KINDS, kind_in, kind_named
-from neuralq.runs.loop import Hook
 from neuralq.runs.offline.files import read_recorded
-from neuralq.runs.recipe.config import config_from_dict, config_to_dict
+from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.report import write_report, write_sweep_report
 from neuralq.runs.sweep import is_sweep_folder, open_sweep
 
@@ -60,8 +56,9 @@ def train(argv: list[str]) -> int:
         is_probed = config.resume_probe and config.dataset is None
         probed = "; for a second it is tried how exactly the environment can be resumed" if is_probed else ""
         say(f"run folder {path}{origin}; preparing (the first run on a machine compiles kernels{probed})")
-        with _hooks(path, config, options.tensorboard, options.wandb, options.hooks) as hooks:
-            run = CONTROL.train(config, path, hooks)
+        own = watching_hooks(path, config, options.tensorboard, options.wandb, options.hooks, say)
+        with own as hooks, training_bar(CONTROL, config) as bar:
+            run = CONTROL.train(config, path, [*hooks, bar])
     if options.doctor or (run.reached is False and run.stopped_by is None):
         for line in examined(run.run_dir, whole=options.doctor):
             say(line)
@@ -84,8 +81,9 @@ def resume(argv: list[str]) -> int:
     path = single_run(options.run, options.trust)
     planned = CONTROL.changed(config_from_dict(read_config(path)), total_steps, changes)
     board, tracker = (path / "tensorboard").is_dir(), (path / "wandb").is_dir()  # where it was begun with them
-    with _hooks(path, planned, board, tracker, options.hook or ()) as hooks:
-        run = CONTROL.resume(path, total_steps, hooks, changes)
+    own = watching_hooks(path, planned, board, tracker, options.hook or (), say)
+    with own as hooks, training_bar(CONTROL, planned) as bar:
+        run = CONTROL.resume(path, total_steps, [*hooks, bar], changes)
     return _conclude(run, options.json, planned.stop_at_return, planned.engine != "auto")
 
 
@@ -138,32 +136,6 @@ def target(text: str) -> float | None:
         (475.0, None)
     """
     return None if text.lower() in ("none", "null") else number(text)
-
-
-@contextlib.contextmanager
-def _hooks(path: Path, config: RunConfig, tensorboard: bool, wandb: bool, own: Sequence[str]) -> Iterator[list[Hook]]:
-    """The hooks of a run, the bar last; closed at the end where they can be."""
-    wanted: list[Callable[[], Hook]] = []
-    if tensorboard:
-        wanted.append(lambda: TensorBoard(path / "tensorboard"))
-    if wandb:
-        wanted.append(lambda: WeightsAndBiases(path, config_to_dict(config)))
-    wanted += [functools.partial(own_hook, name, config) for name in own]
-    with contextlib.ExitStack() as stack:
-        hooks: list[Hook] = []
-        for make in wanted:
-            hooks.append(make())
-            if callable(close := getattr(hooks[-1], "close", None)):
-                stack.callback(_end, close, hooks[-1])
-        yield [*hooks, stack.enter_context(training_bar(CONTROL, config))]
-
-
-def _end(close: Callable[[], object], hook: Hook) -> None:
-    """Close a hook; the run is whole whatever that raises."""
-    try:
-        close()
-    except Exception as error:
-        say(f"the hook {type(hook).__qualname__} raised {type(error).__name__} when it was closed: {error}")
 
 
 def evaluate(argv: list[str]) -> int:

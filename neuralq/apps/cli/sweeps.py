@@ -4,54 +4,59 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
 
-from neuralq.apps.cli import Failure, main, print_result
+from rich.markup import escape
+from rich.table import Table
+
+from neuralq.apps.cli import Failure, print_result
 from neuralq.apps.cli.kinds import say
 from neuralq.apps.cli.option_table import TrainOptions
 from neuralq.apps.cli.progress import ProgressBar, Told
 from neuralq.runs import RunConfig
-from neuralq.runs.children import python_command
 from neuralq.runs.control import CONTROL
 from neuralq.runs.evaluation import shown
-from neuralq.runs.folder.origin import flat_names
-from neuralq.runs.folder.run_folder import RunFolderError, claimed, default_run_path, is_run_folder, read_config
+from neuralq.runs.folder.run_folder import claimed, default_run_path, is_run_folder, read_config
 from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
 from neuralq.runs.play_off import told_of
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.sweep import (
+    Engine,
+    LocalProcesses,
+    Member,
     Status,
     Sweep,
     SweepResult,
     create_sweep,
     is_sweep_folder,
-    num_cores,
     open_sweep,
     run_sweep,
-    stop_with_parent,
 )
 from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.runs.trust import refuse_strangers
 
 __all__ = [
     "add_trust",
-    "child",
+    "add_which",
     "refuse_other_kinds",
     "resume_seeds",
+    "run_to_the_end",
     "single_run",
     "started_from",
     "sweep_bar",
     "train_seeds",
 ]
 
-_CHILD = "from neuralq.apps.cli.sweeps import child; child()"
+_MOST_LINES = 200
+"""Of runs, of which each is told at the end."""
+_MOST_ROWS = 12
+"""Of combinations of values, in the table that is drawn while a sweep runs."""
 
 
 def train_seeds(config: RunConfig, options: TrainOptions) -> int:
@@ -64,7 +69,8 @@ def train_seeds(config: RunConfig, options: TrainOptions) -> int:
     seeds = range(config.seed, config.seed + options.seeds)
     with claimed(options.run_dir, lambda: _default_path(config)) as path:
         sweep = create_sweep(path, config_to_dict(config), seeds, flags)
-    return _run(sweep, options.workers, options.json, started_from(config, options))
+    engine = LocalProcesses(options.workers, sweep.config)
+    return run_to_the_end(sweep, engine, options.json, started_from(config, options))
 
 
 def _default_path(config: RunConfig) -> Path:
@@ -89,14 +95,20 @@ def resume_seeds(
     trust: str = "true",
 ) -> int:
     """Go on with a sweep: seeds that have not finished, and those that failed."""
+    sweep = open_sweep(path)
+    members = list(sweep.members())
     if trust == "false":
-        sweep = open_sweep(path)
-        runs = [run for run in map(sweep.run_path, sweep.seeds) if is_run_folder(run)]
-        for config in (sweep.config, *map(read_config, runs)):
+        runs = [run for run in (sweep.path / member.name for member in members) if is_run_folder(run)]
+        for config in (*map(sweep.configuration, members), *map(read_config, runs)):
             refuse_strangers(config, *(name for name in sweep.options if ":" in name))
-    plain = config_to_dict(CONTROL.changed(config_from_dict(open_sweep(path).config), None, changes))
-    parts = {name.partition(".")[0]: plain[name.partition(".")[0]] for name in changes}
-    return _run(open_sweep(path, total_steps, parts), num_workers, as_json, "")
+    first = config_from_dict(sweep.configuration(members[0]))
+    plain = config_to_dict(CONTROL.changed(first, None, changes))
+    if sweep.axes is None:
+        parts = {name.partition(".")[0]: plain[name.partition(".")[0]] for name in changes}
+    else:  # its options are keywords, and settings of a learner stand flat among them
+        parts = {CONTROL.full_name(first, name).rpartition(".")[2]: value for name, value in changes.items()}
+    sweep = open_sweep(path, total_steps, parts)
+    return run_to_the_end(sweep, LocalProcesses(num_workers, sweep.configuration(members[0])), as_json)
 
 
 def add_which(parser: argparse.ArgumentParser) -> None:
@@ -145,102 +157,138 @@ def refuse_other_kinds(path: str | Path) -> None:
         raise Failure(f"{path} is {kind_named(name).title}, which is {command.instead.format(run=path)}", 2)
 
 
-def child() -> None:
-    """One seed: the command line in a process that stops with its parent."""
-    stop_with_parent()
-    sys.exit(main(sys.argv[1:]))
+def run_to_the_end(
+    sweep: Sweep,
+    engine: Engine,
+    as_json: bool,
+    origin: str = "",
+    members: Sequence[Member] | None = None,
+    retry_failed: bool = True,
+) -> int:
+    """Make the runs of a sweep and tell what they came to.
 
+    Args:
+        sweep: which.
+        engine: what makes the runs.
+        as_json: whether to print the result as JSON.
+        origin: where settings come from that nobody gave, for the first line.
+        members: some of its runs; all by default.
+        retry_failed: whether runs that failed before are begun again.
 
-def _command(sweep: Sweep, seed: int) -> list[str]:
-    begin = python_command(_CHILD)
-    path = str(sweep.run_path(seed))
-    if is_run_folder(path):
-        options = list(sweep.options)
-        hooks = options[options.index("--hook") :] if "--hook" in options else []
-        told = [f"--set={name}={'none' if value is None else value}" for name, value in _moved(sweep, path).items()]
-        return [*begin, "resume", path, "--total-steps", str(sweep.total_steps), *told, *hooks]
-    config = ["--config", str(sweep.path / "config.json"), "--preset", "false"]
-    return [*begin, "train", *config, "--seed", str(seed), "--run-dir", path, *sweep.options]
-
-
-def _moved(sweep: Sweep, run: str) -> dict[str, Any]:
-    """What a seed may go on with otherwise than it began, and the sweep by now has otherwise."""
-    try:
-        began = read_config(run)
-    except RunFolderError:  # its process will say so
-        return {}
-    wanted, began = flat_names(sweep.config), flat_names(began)
-    names = [name for name in sorted(CONTROL.may_change() - {CONTROL.budget}) if name in wanted and name in began]
-    return {name: wanted[name] for name in names if wanted[name] != began[name]}
-
-
-def _run(sweep: Sweep, num_workers: int | None, as_json: bool, origin: str) -> int:
-    workers = min(num_workers or num_cores(), len(sweep.seeds))
-    say(f"sweep folder {sweep.path}{origin}; {len(sweep.seeds)} seeds, {workers} at a time")
-    with sweep_bar(sweep) as bar:
-        result = run_sweep(sweep, _command, num_workers, bar)
-    target = sweep.config.get("stop_at_return")
-    plain = {**result.plain(), "sweep_dir": str(sweep.path)}
-    print_result(plain, as_json, _lines(sweep, result))
+    Returns:
+        The exit status: 0 only if each run finished and, where a target was set, reached it; that of the signal that
+        ended it.
+    """
+    number, again = len(sweep) if members is None else len(members), _again(sweep)
+    share = "" if members is None else f" of {len(sweep):,}"
+    say(f"sweep folder {sweep.path}{origin}; {number:,}{share} {_things(sweep)}, {engine.title}")
+    with sweep_bar(sweep, number=number) as bar:
+        result = run_sweep(sweep, engine, bar, retry_failed, members)
+    print_result({**result.plain(), "sweep_dir": str(sweep.path)}, as_json, _lines(sweep, result))
     if result.interrupted_by is not None:
-        say(f"{result.interrupted_by}: go on with: neuralq resume {sweep.path}")
+        say(f"{result.interrupted_by}: go on with: {again}")
         return 128 + signal.Signals[result.interrupted_by].value
-    failed = [run.seed for run in result.runs if run.state == "failed"]
+    failed = [run for run in result.runs if run.state == "failed"]
+    if failed and sweep.axes is None:
+        seeds = ", ".join(str(run.seed) for run in failed)
+        raise Failure(f"seed{'s' * (len(failed) > 1)} {seeds} failed, try again with: {again}")
     if failed:
-        named = f"seed {failed[0]}" if len(failed) == 1 else f"seeds {', '.join(map(str, failed))}"
-        raise Failure(f"{named} failed, try again with: neuralq resume {sweep.path}")
+        raise Failure(f"{len(failed):,} of {number:,} runs failed, try again with: {again} --retry-failed")
     missed = [str(run.seed) for run in result.runs if run.summary.get("reached") is False]
-    if missed:
+    if missed and sweep.axes is None:
+        target = sweep.config.get("stop_at_return")
         raise Failure(f"the target of {target:g} was not reached by {len(missed)} seeds: {', '.join(missed)}")
+    if missed:
+        raise Failure(f"the target was not reached by {len(missed):,} of {number:,} runs")
     return 0
+
+
+def _again(sweep: Sweep) -> str:
+    return f"neuralq {'resume' if sweep.axes is None else 'sweep'} {sweep.path}"
+
+
+def _things(sweep: Sweep) -> str:
+    return "seeds" if sweep.axes is None else "runs"
 
 
 def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
     lines = []
-    for run in result.runs:
+    for run in result.runs if len(result.runs) <= _MOST_LINES else ():
+        name = run.run_dir.relative_to(sweep.path).as_posix().replace("seed-", "seed ")
         if run.state == "finished":
             seconds = run.summary.get("cpu_seconds") or 0.0
             spent = f"{run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds"
-            lines.append(f"seed {run.seed}: {told_of(run.summary)}, {spent}")
+            lines.append(f"{name}: {told_of(run.summary)}, {spent}")
         else:
-            log = f" (see {sweep.log_path(run.seed)})" if run.reason else ""
-            lines.append(f"seed {run.seed}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
+            log = f" (see {run.run_dir}.log)" if run.reason else ""
+            lines.append(f"{name}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
     found = result.estimate
     if found is not None:
         text = f"greedy return, interquartile mean over {found.num_runs} seeds: {shown(found.iqm, 2)}"
         if found.low is not None and found.high is not None:
             text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
         lines.append(text)
+    if sweep.axes:
+        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes))}")
     return [*lines, f"sweep folder {sweep.path}"]
 
 
 def sweep_bar(
-    sweep: Sweep, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    sweep: Sweep,
+    stream: TextIO | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    number: int | None = None,
 ) -> ProgressBar[Status]:
-    """Progress over all seeds: steps, rate, and the interquartile mean of those that have finished.
+    """Progress over all runs: steps, rate, and the interquartile mean of those that have finished.
+
+    Args:
+        sweep: which.
+        stream: where to draw.
+        clock: tells the time in seconds.
+        number: how many of its runs; all by default.
 
     Example:
         >>> import io
         >>> out = io.StringIO()
         >>> with sweep_bar(Sweep(Path(), {"total_steps": 100}, (0, 1)), out) as bar:
-        ...     bar(Status(50, 200, (1,), 1, (), (31.0,)))
+        ...     bar(Status(50, 200, ("seed-1",), 1, (), {"seed-0": 31.0}))
         >>> out.getvalue().strip()
         '1 of 2 seeds · 50 of 200 steps · IQM 31.0'
     """
     began: list[tuple[float, int]] = []
+    count = len(sweep) if number is None else number
 
     def tell(status: Status) -> Told:
         now = clock()
         began[1:] = [(now, status.env_steps)]  # the first stays
         seconds, steps = now - began[0][0], status.env_steps - began[0][1]
-        parts = [f"{status.num_finished} of {len(sweep.seeds)} seeds"]
+        parts = [f"{status.num_finished:,} of {count:,} {_things(sweep)}"]
         if status.failed:
-            parts.append(f"failed: {', '.join(map(str, status.failed))}")
+            named = ", ".join(name.removeprefix("seed-") for name in status.failed[:_MOST_ROWS])
+            parts.append(f"failed: {named if sweep.axes is None else len(status.failed)}")
         parts.append(f"{status.env_steps:,} of {status.total_steps:,} steps")
         if seconds > 0:
             parts.append(f"{steps / seconds:,.0f} steps/s")
-        if status.returns:
-            parts.append(f"IQM {shown(float(interquartile_mean(status.returns)))}")
-        return Told(status.env_steps, parts, event=status.num_finished + len(status.failed))
+        if status.returns and sweep.axes is None:
+            parts.append(f"IQM {shown(float(interquartile_mean(list(status.returns.values()))))}")
+        ended = status.num_finished + len(status.failed)
+        return Told(status.env_steps, parts, event=ended, total=status.total_steps)
 
-    return ProgressBar(sweep.total_steps * len(sweep.seeds), tell, stream, clock)
+    return ProgressBar(1, tell, stream, clock, _cells if sweep.axes else None)
+
+
+def _cells(status: Status) -> Table:
+    """What each combination of values has come to so far, the best first."""
+    scores: dict[str, list[float]] = {}
+    for name, score in status.returns.items():
+        scores.setdefault(name.rpartition("/")[0], []).append(score)
+    rows = [(float(interquartile_mean(found)), cell, len(found)) for cell, found in scores.items()]
+    rows.sort(reverse=True)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading, justify in (("IQM", "right"), ("finished", "right"), ("options", "left")):
+        table.add_column(heading, justify=justify, no_wrap=True)  # type: ignore[arg-type]  # one of rich's words
+    for iqm, cell, number in rows[:_MOST_ROWS]:
+        table.add_row(shown(iqm), str(number), escape(cell[: -len("-12345678")]))
+    if len(rows) > _MOST_ROWS:
+        table.add_row("…", "", f"and {len(rows) - _MOST_ROWS} more")
+    return table

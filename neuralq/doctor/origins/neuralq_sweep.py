@@ -10,9 +10,9 @@ from neuralq.doctor.origins.neuralq_run import NEURALQ_RUN
 from neuralq.doctor.origins.record import Origin
 from neuralq.doctor.subject import Subject
 from neuralq.doctor.weights import CannotLoad
-from neuralq.runs.folder.run_folder import RunFolderError, read_summary
+from neuralq.runs.folder.run_folder import RunFolderError
 from neuralq.runs.play_off import score_of
-from neuralq.runs.sweep.folder import has_finished, is_sweep_folder, open_sweep
+from neuralq.runs.sweep.folder import is_sweep_folder, open_sweep
 
 __all__ = ["NEURALQ_SWEEP"]
 
@@ -20,17 +20,18 @@ __all__ = ["NEURALQ_SWEEP"]
 def _load(path: Path, net: str | None, env: Any) -> Subject:
     try:
         sweep = open_sweep(path)
-        finished = [seed for seed in sweep.seeds if has_finished(sweep, seed)]
-        scores = {seed: score_of(read_summary(sweep.run_path(seed))) for seed in finished}
+        states = {member: sweep.state(member) for member in sweep.members()}
+        scores = {member: score_of(state.summary) for member, state in states.items() if state.state == "finished"}
     except RunFolderError as error:
         raise CannotLoad(f"cannot load the sweep {path}: {error}") from error
-    returns = {seed: score.mean for seed, score in scores.items() if score is not None}
+    returns = {member: score.mean for member, score in scores.items() if score is not None}
     if not returns:
-        raise CannotLoad(f"no seed of the sweep {path} has finished; go on with it: neuralq resume {path}")
-    worst = min(returns, key=lambda seed: returns[seed])
-    subject = NEURALQ_RUN.load(sweep.run_path(worst), net, env)
-    origin = f"seed {worst}, the worst of {len(returns)} of the sweep {path}"
-    return replace(subject, origin=origin, siblings=tuple(returns.values()))
+        raise CannotLoad(f"no run of the sweep {path} has finished; go on with it: neuralq resume {path}")
+    worst = min(returns, key=lambda member: returns[member])
+    subject = NEURALQ_RUN.load(path / worst.name, net, env)
+    alike = [score for member, score in returns.items() if member.options == worst.options]
+    origin = f"{worst.name.replace('seed-', 'seed ')}, the worst of {len(returns)} of the sweep {path}"
+    return replace(subject, origin=origin, siblings=tuple(alike))
 
 
 NEURALQ_SWEEP = Origin("a neuralq sweep folder", is_sweep_folder, _load, place=1)

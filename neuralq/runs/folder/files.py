@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import stat
+import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
@@ -47,6 +48,7 @@ __all__ = [
 ]
 
 _MOST_NESTED = 64
+_GLANCES, _GLANCE_SECONDS = 3, 0.02
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{16}-(.+)")
 _SEAL = re.compile(rb',\s*"crc32": "([0-9a-f]{8})"\s*\}\s*\Z')
 
@@ -82,7 +84,7 @@ class FolderLock:
     def __init__(self, file: Path, busy: str) -> None:
         self._descriptor: int | None = open_regular(file, os.O_RDWR | os.O_CREAT)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take()
         except BaseException as error:
             holder = os.pread(self._descriptor, 32, 0).decode(errors="replace").strip() or "unknown"
             os.close(self._descriptor)
@@ -94,6 +96,15 @@ class FolderLock:
         os.ftruncate(self._descriptor, 0)
         with contextlib.suppress(OSError):  # a full disk has no room for the number, and holds the lock all the same
             os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def _take(self) -> None:
+        """Whoever only looks whether somebody holds it (`neuralq.runs.sweep.states`) has it for a moment."""
+        assert self._descriptor is not None
+        for _ in range(_GLANCES):
+            with contextlib.suppress(BlockingIOError):
+                return fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            time.sleep(_GLANCE_SECONDS)
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     @property
     def is_held(self) -> bool:

@@ -176,7 +176,7 @@ def algorithm_in(settings: Mapping[str, Any]) -> str:
 def _run_folders(path: Path) -> list[Path]:
     if is_sweep_folder(path):
         sweep = open_sweep(path)
-        return [sweep.run_path(seed) for seed in sweep.seeds]
+        return [sweep.path / member.name for member in sweep.members()]
     if not is_run_folder(path):
         raise RunFolderError(f"there is neither a run nor a sweep in {path}; name folders that `neuralq train` made")
     return [path]

@@ -11,7 +11,6 @@ import contextlib
 import multiprocessing
 import os
 import re
-import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -22,7 +21,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 
 from neuralq.checks import check_whole
-from neuralq.runs.children import safe_path
+from neuralq.runs.children import safe_path, without_main
 from neuralq.runs.stream.vector_env import SubEnv, SubEnvFault
 
 __all__ = ["WorkerVectorEnv", "make_worker_env"]
@@ -146,20 +145,7 @@ def make_worker_env(make: Callable[[], gym.Env[Any, Any]], num_envs: int) -> Wor
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["neuralq.runs.recipe.environments"])
     makers = [partial(_made, make, index, os.getpid()) for index in range(num_envs)]
-    with safe_path(), _without_main():
+    with safe_path(), without_main():
         return WorkerVectorEnv(
             makers, copy=False, context="forkserver", autoreset_mode=AutoresetMode.DISABLED, daemon=True
         )
-
-
-@contextlib.contextmanager
-def _without_main() -> Iterator[None]:
-    """Processes started in the block do not run the program's main file again, which trains."""
-    main: Any = sys.modules["__main__"]
-    kept = {name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__}
-    main.__dict__.pop("__file__", None)
-    main.__spec__ = None
-    try:
-        yield
-    finally:
-        main.__dict__.update(kept)

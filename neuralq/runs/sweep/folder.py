@@ -1,24 +1,44 @@
-"""The folder of a sweep: what it holds, and how far each seed has come."""
+"""The folder of a sweep: what was asked for, and the run folders that it comes to."""
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import open_regular, parse_json, read_json, to_json, write_durably
-from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder, read_summary
+from neuralq.runs.folder.files import read_json, to_json, write_durably
+from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder
+from neuralq.runs.sweep.asked import Asked, cell_name, check_seeds, resolved
+from neuralq.runs.sweep.states import RunState, state_of
+from neuralq.runs.sweep.work import Task
 
-__all__ = ["Sweep", "create_sweep", "has_finished", "is_sweep_folder", "open_sweep", "steps_so_far"]
+__all__ = ["Member", "Sweep", "ask", "create_sweep", "is_sweep_folder", "open_sweep"]
 
 FORMAT_NAME = "neuralq-sweep"
-FORMAT_VERSION = 1
-_TAIL_BYTES = 1 << 16
+FORMAT_VERSION = 2
+_OF_SEEDS = 1
+"""The version of sweeps whose configuration is whole and whose runs differ in their seed alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """One run of a sweep.
+
+    Args:
+        options: in which it differs from others, by name; empty where seeds are all there is.
+        seed: of the run.
+        name: of its folder within the sweep's, with ``/`` between folders.
+        total_steps: its budget; None where a preset decides it.
+    """
+
+    options: Mapping[str, Any]
+    seed: int
+    name: str
+    total_steps: int | None
 
 
 @dataclass(frozen=True)
@@ -27,28 +47,62 @@ class Sweep:
 
     Args:
         path: the folder.
-        config: what all seeds share, as `neuralq.runs.recipe.config.config_to_dict` writes it.
-        seeds: one run each.
+        config: what all runs share. Without ``axes`` a whole configuration, as
+            `neuralq.runs.recipe.config.config_to_dict` writes it; with them keywords of `neuralq.train`, under which
+            stand presets.
+        seeds: one run each, of every combination of values.
         options: what else was asked for, as words of the command line.
+        axes: the values of options along which runs differ; None where seeds are all there is.
     """
 
     path: Path
     config: dict[str, Any]
     seeds: tuple[int, ...]
     options: tuple[str, ...] = ()
+    axes: dict[str, list[Any]] | None = None
+    _cells: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
-    def total_steps(self) -> int:
-        """Environment steps of each seed."""
-        return int(self.config["total_steps"])
+    def asked(self) -> Asked:
+        """What it was asked for."""
+        return Asked(self.config, self.axes or {}, self.seeds)
+
+    def __len__(self) -> int:
+        """How many runs."""
+        return self.asked.num_cells * len(self.seeds)
+
+    def members(self) -> Iterator[Member]:
+        """Every run, seed by seed: early on there is something of each combination of values."""
+        cells = [(cell, f"{cell_name(cell)}/" if cell else "") for cell in self.asked.cells()]
+        steps = self.config.get("total_steps")
+        for seed in self.seeds:
+            for cell, folder in cells:
+                yield Member(cell, seed, f"{folder}seed-{seed}", cell.get("total_steps", steps))
+
+    def configuration(self, member: Member) -> dict[str, Any]:
+        """The whole configuration of a run.
+
+        Raises:
+            ValueError: if what was asked for is no configuration.
+        """
+        if self.axes is None:
+            return {**self.config, "seed": member.seed}
+        place = member.name.rpartition("/")[0]
+        if place not in self._cells:
+            self._cells[place] = resolved(self.config, member.options, member.seed)
+        return {**self._cells[place], "seed": member.seed}
+
+    def task(self, member: Member) -> Task:
+        """What a process needs to know to make a run."""
+        return Task(member.name, self.path / member.name, self.configuration(member), self.options)
+
+    def state(self, member: Member) -> RunState:
+        """How far a run has come."""
+        return state_of(self.path / member.name, member.total_steps)
 
     def run_path(self, seed: int) -> Path:
-        """Run folder of a seed."""
+        """Run folder of a seed, where seeds are all there is."""
         return self.path / f"seed-{seed}"
-
-    def log_path(self, seed: int) -> Path:
-        """What the process of a seed printed."""
-        return self.path / f"seed-{seed}.log"
 
 
 def is_sweep_folder(path: str | Path) -> bool:
@@ -64,7 +118,7 @@ def is_sweep_folder(path: str | Path) -> bool:
 def create_sweep(
     path: str | Path, config: Mapping[str, Any], seeds: Sequence[int], options: Sequence[str] = ()
 ) -> Sweep:
-    """A new sweep in ``path``, which is made if missing and must hold neither a sweep nor a run.
+    """A new sweep of seeds in ``path``, which is made if missing and must hold neither a sweep nor a run.
 
     Raises:
         ValueError: without seeds, or with one named twice.
@@ -76,27 +130,74 @@ def create_sweep(
         >>> open_sweep(sweep.path).seeds
         (0, 1, 2)
     """
-    path = Path(path)
-    _check_seeds(list(seeds))
+    check_seeds(list(seeds))
+    sweep = Sweep(Path(path), dict(config), tuple(seeds), tuple(options))
     if is_sweep_folder(path):
         raise RunFolderError(f"{path} already holds a sweep; continue it with `neuralq resume {path}`")
-    if is_run_folder(path):
-        raise RunFolderError(f"{path} already holds a run; choose another folder with --run-dir")
-    path.mkdir(parents=True, exist_ok=True)
-    write_durably(path / "config.json", to_json(config, "config"))
-    marker = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "seeds": list(seeds), "options": list(options)}
-    write_durably(path / "sweep.json", to_json(marker, "sweep", sealed=True))  # last: it marks a sweep
-    return Sweep(path, dict(config), tuple(seeds), tuple(options))
+    _write_new(sweep)
+    return sweep
 
 
-def _check_seeds(seeds: Any) -> None:
-    """They become names of folders, so nothing but whole numbers will do."""
-    for seed in seeds if isinstance(seeds, list) else ():
-        if not isinstance(seed, int):
-            raise ValueError(f"seed must be a whole number, got {seed!r}")
-        check_whole("seed", seed, 0)
-    if not isinstance(seeds, list) or not seeds or len(set(seeds)) < len(seeds):
-        raise ValueError(f"a sweep needs one seed or more, each named once, got {seeds!r}")
+def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
+    """The sweep of what is asked for in ``path``: a new one, or the one that is there, with new values and seeds.
+
+    Raises:
+        ValueError: if what is asked for is no configuration, for one of the combinations of values.
+        RunFolderError: if there is a run in ``path``, or a sweep that was asked for otherwise.
+
+    Example:
+        >>> import tempfile
+        >>> path, base = Path(tempfile.mkdtemp(), "s"), {"env": "CartPole-v1", "total_steps": 100}
+        >>> len(ask(path, Asked(base, {"gamma": [0.9]}, (0, 1)))), len(ask(path, Asked(base, {"gamma": [0.99]}, (0,))))
+        (2, 4)
+    """
+    new = Sweep(Path(path), asked.base, asked.seeds, tuple(options), asked.axes)
+    if not is_sweep_folder(path):
+        _check_cells(new)
+        _write_new(new)
+        return new
+    old = open_sweep(path)
+    if old.axes is None:
+        raise RunFolderError(f"{path} is a sweep of seeds that `neuralq train --seeds` made; choose another folder")
+    try:
+        both = old.asked.joined(asked)
+    except ValueError as error:
+        raise RunFolderError(f"{path} already holds a sweep: {error}") from error
+    sweep = Sweep(old.path, old.config, both.seeds, old.options, both.axes)
+    if (both.axes, both.seeds) != (old.axes, old.seeds):
+        _check_cells(sweep)
+        _write_marker(sweep)
+    return sweep
+
+
+def _check_cells(sweep: Sweep) -> None:
+    """Raises ValueError where a combination of values is no configuration: before anything is begun."""
+    for cell in sweep.asked.cells():
+        try:
+            resolved(sweep.config, cell, sweep.seeds[0])
+        except ValueError as error:
+            where = ", ".join(f"{name} {value!r}" for name, value in cell.items())
+            raise ValueError(f"{error}{f' (with {where})' if where else ''}") from error
+
+
+def _write_new(sweep: Sweep) -> None:
+    if is_run_folder(sweep.path):
+        raise RunFolderError(f"{sweep.path} already holds a run; choose another folder")
+    sweep.path.mkdir(parents=True, exist_ok=True)
+    write_durably(sweep.path / "config.json", to_json(sweep.config, "config"))
+    _write_marker(sweep)  # last: it marks a sweep
+
+
+def _write_marker(sweep: Sweep) -> None:
+    marker: dict[str, Any] = {
+        "format": FORMAT_NAME,
+        "version": _OF_SEEDS if sweep.axes is None else FORMAT_VERSION,
+        "seeds": list(sweep.seeds),
+        "options": list(sweep.options),
+    }
+    if sweep.axes is not None:
+        marker["axes"] = sweep.axes
+    write_durably(sweep.path / "sweep.json", to_json(marker, "sweep", sealed=True))
 
 
 def _check_options(options: Any) -> None:
@@ -112,26 +213,26 @@ def _check_options(options: Any) -> None:
         raise ValueError(f"its options hold {words[0]!r}, which no sweep is begun with")
 
 
+def _check_axes(axes: Any) -> None:
+    """They become names of folders and of options."""
+    if axes is not None and not (isinstance(axes, dict) and all(isinstance(values, list) for values in axes.values())):
+        raise ValueError(f"its axes must hold a list for each option, got {axes!r}")
+
+
 def open_sweep(
     path: str | Path, total_steps: int | None = None, changes: Mapping[str, Any] = MappingProxyType({})
 ) -> Sweep:
-    """The sweep in ``path``, with a new budget for every seed if ``total_steps`` is given, and other changes.
+    """The sweep in ``path``, with a new budget for every run if ``total_steps`` is given, and other changes.
 
     Raises:
         RunFolderError: if there is none, or its files are damaged.
+        ValueError: if what is to be changed is what runs differ in.
     """
     path = Path(path)
     if not is_sweep_folder(path):
         raise RunFolderError(f"there is no sweep in {path}; start one with `neuralq train ENV --seeds 10`")
     try:
-        marker, config = (read_json(path / name) for name in ("sweep.json", "config.json"))
-        if marker["format"] != FORMAT_NAME or marker["version"] > FORMAT_VERSION:
-            raise ValueError(f"it is of format {marker['format']!r}, version {marker['version']!r}")
-        _check_seeds(marker["seeds"])
-        _check_options(marker["options"])
-        check_whole("total_steps", config["total_steps"])
-        check_whole("threads", config.get("threads", 1))
-        sweep = Sweep(path, config, tuple(marker["seeds"]), tuple(marker["options"]))
+        sweep = _read(path)
     except KeyError as error:
         raise RunFolderError(f"the sweep in {path} cannot be read: {error} is missing; restore its files") from error
     except (RunFolderError, OSError, ValueError, TypeError) as error:
@@ -139,35 +240,26 @@ def open_sweep(
     if total_steps is not None:
         check_whole("total_steps", total_steps)
         changes = {**changes, "total_steps": total_steps}
+    if differing := sorted(changes.keys() & (sweep.axes or {}).keys()):
+        raise ValueError(f"{differing[0]} is what the runs of {path} differ in, and cannot be changed for all of them")
     if changes:
         sweep.config.update(changes)
         write_durably(path / "config.json", to_json(sweep.config, "config"))
     return sweep
 
 
-def has_finished(sweep: Sweep, seed: int) -> bool:
-    """Whether the summary of a seed says that its budget is spent, its target reached, or that a hook stopped it."""
-    path = sweep.run_path(seed)
-    if not (is_run_folder(path) and (path / "summary.json").exists()):
-        return False
-    try:
-        summary = read_summary(path)
-    except RunFolderError:  # damaged; the run writes it anew
-        return False
-    if summary.get("interrupted_by") is not None:
-        return False
-    steps = summary.get("env_steps")
-    if summary.get("stopped_by") is not None:  # by a hook, which would stop it again
-        return True
-    return bool(summary.get("reached")) or (isinstance(steps, int) and steps >= sweep.total_steps)
-
-
-def steps_so_far(run_dir: Path) -> int:
-    """Environment steps in the last whole line of ``metrics.jsonl``; the file may grow meanwhile."""
-    try:
-        with open(open_regular(run_dir / "metrics.jsonl", os.O_RDONLY), "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-            *_, last, _ = [b"", *file.read().split(b"\n")]
-            return int(parse_json(last)["env_steps"])
-    except (RunFolderError, OSError, ValueError, KeyError, TypeError, OverflowError):
-        return 0
+def _read(path: Path) -> Sweep:
+    marker, config = (read_json(path / name) for name in ("sweep.json", "config.json"))
+    if marker["format"] != FORMAT_NAME or marker["version"] > FORMAT_VERSION:
+        raise ValueError(f"it is of format {marker['format']!r}, version {marker['version']!r}")
+    check_seeds(marker["seeds"])
+    _check_options(marker["options"])
+    axes = marker["axes"] if marker["version"] > _OF_SEEDS else None
+    _check_axes(axes)
+    if axes is None or "total_steps" in config:
+        check_whole("total_steps", config["total_steps"])
+    check_whole("threads", config.get("threads", 1))
+    sweep = Sweep(path, config, tuple(marker["seeds"]), tuple(marker["options"]), axes)
+    if sweep.asked.num_cells < 1:
+        raise ValueError("it has no runs")
+    return sweep

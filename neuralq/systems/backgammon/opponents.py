@@ -29,7 +29,7 @@ __all__ = ["INSTALL", "GnubgPlayer", "IllegalTurn", "gnubg_equity", "index_of", 
 INSTALL = "pip install 'neuralq[gnubg]' (GNU Backgammon's networks, under the GPL)"
 
 
-class IllegalTurn(RuntimeError):
+class IllegalTurn(ValueError):
     """An opponent has answered with a turn that the rules do not allow."""
 
 

@@ -1,4 +1,4 @@
-"""The errors that are answers to what was asked; a command prints their message and no traceback.
+"""The errors that are answers to what was asked: their message is told, and no traceback.
 
 Environments, bodies and hooks are somebody's own code: where that raised, its file and line are named too.
 """
@@ -23,7 +23,6 @@ from neuralq.runs.folder.checkpoint import CheckpointError
 from neuralq.runs.folder.run_folder import RunFolderError
 from neuralq.runs.loop import Diverged, HookFault
 from neuralq.runs.stream import EnvironmentFault
-from neuralq.systems.backgammon.opponents import IllegalTurn
 
 __all__ = ["USER_FAULTS", "explained", "own_frame"]
 
@@ -32,7 +31,6 @@ USER_FAULTS = (
     Diverged,
     EnvironmentFault,
     HookFault,
-    IllegalTurn,
     MemoryError,
     MissingExtra,
     OSError,

@@ -1,0 +1,140 @@
+"""``neuralq sweep``: combinations of options times seeds, here, on a cluster, or share by share."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+from neuralq.apps.cli import Failure, command_parser, print_result
+from neuralq.apps.cli.sweeps import run_to_the_end
+from neuralq.apps.cli.yaml_text import read_text
+from neuralq.runs.folder.run_folder import RunFolderError
+from neuralq.runs.hooks import own_hook
+from neuralq.runs.sweep import (
+    Asked,
+    Engine,
+    LocalProcesses,
+    Member,
+    RunState,
+    Sweep,
+    ask,
+    is_sweep_folder,
+    open_sweep,
+    read_asked,
+    share_of,
+)
+
+__all__ = ["REQUEUE", "sweep"]
+
+REQUEUE = 75
+"""Exit status of a share that was asked to end before its end: to be begun again (EX_TEMPFAIL of sysexits.h)."""
+
+_MOST_REASONS = 20
+
+
+def sweep(argv: list[str]) -> int:
+    """Make the runs that a file asks for, or go on with them; or tell how far they are."""
+    options = _parser().parse_args(argv)
+    *file, folder = options.what
+    found = _asked_for(file[0], folder, options) if file else _there(folder)
+    if options.status:
+        return _status(found, options.json)
+    members = None if options.index is None else share_of(found, options.index, options.of or len(found))
+    engine = _engine(found, options)
+    if members is None:
+        return run_to_the_end(found, engine, options.json, retry_failed=options.retry_failed)
+    status = run_to_the_end(found, engine, options.json, members=members, retry_failed=options.retry_failed)
+    return REQUEUE if status > 128 else status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "sweep",
+        "Make a run for every combination of options and seed that a file asks for, in a folder of its own. What is "
+        "in the file: keywords of neuralq.train, each a value, a list or a range; and seeds. The same command goes on "
+        "with what was stopped or killed, and repeats nothing (docs/scale.md).",
+        "neuralq sweep rates.yaml runs/rates",
+        "neuralq sweep runs/rates --status",
+        "neuralq sweep runs/rates --index 3 --of 20",
+        "neuralq compare runs/rates --by learning_rate --out rates.svg",
+    )
+    parser.add_argument("what", nargs="+", metavar="FILE.yaml DIR", help="what is asked for, and where the runs go")
+    parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
+    parser.add_argument("--status", action="store_true", help="tell how far each run is, and make none")
+    parser.add_argument("--retry-failed", action="store_true", help="begin runs again that have failed")
+    parser.add_argument("--index", type=int, metavar="I", help="make one share of the runs, counted from 0")
+    parser.add_argument("--of", type=int, metavar="N", help="how many shares there are (default: one for each run)")
+    parser.add_argument(
+        "--hook", action="append", default=[], metavar="module:name", help="watches each run, as for neuralq train"
+    )
+    parser.add_argument("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
+    parser.add_argument("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
+    return parser
+
+
+def _asked_for(file: str, folder: str, options: argparse.Namespace) -> Sweep:
+    words = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
+    for hook in options.hook:
+        own_hook(hook)  # a name that is wrong is one error, not one for each run
+        words += ["--hook", hook]
+    asked = _read(file)
+    try:
+        return ask(folder, asked, words)
+    except ValueError as error:
+        raise Failure(f"{file}: {error}", 2) from error
+
+
+def _read(file: str) -> Asked:
+    try:
+        content = read_text(Path(file).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise Failure(f"cannot read {file}: {' '.join(str(error).split())}", 2) from error
+    if not isinstance(content, dict):
+        raise Failure(f"{file} must hold a mapping of options, got {type(content).__name__}", 2)
+    try:
+        return read_asked(content)
+    except ValueError as error:
+        raise Failure(f"{file}: {error}", 2) from error
+
+
+def _there(folder: str) -> Sweep:
+    if Path(folder).is_file():
+        raise Failure(f"{folder} says what to run; say where to, too: neuralq sweep {folder} DIR", 2)
+    if not is_sweep_folder(folder):
+        raise RunFolderError(f"there is no sweep in {folder}; start one with: neuralq sweep FILE.yaml {folder}")
+    return open_sweep(folder)
+
+
+def _engine(found: Sweep, options: argparse.Namespace) -> Engine:
+    first = next(found.members())
+    return LocalProcesses(options.workers, found.configuration(first))
+
+
+def _status(found: Sweep, as_json: bool) -> int:
+    """How far each run is; the exit status is 0 whatever that is."""
+    states = [(member, found.state(member)) for member in found.members()]
+    counted = Counter(state.state for _, state in states)
+    told = [f"{counted[name]:,} {name}" for name in ("finished", "running", "stopped", "failed", "not begun")]
+    failed = [(member, state) for member, state in states if state.state == "failed"]
+    lines = [f"{len(states):,} runs: {', '.join(told)}"]
+    lines += [f"{member.name}: {state.reason}" for member, state in failed[:_MOST_REASONS]]
+    if len(failed) > _MOST_REASONS:
+        lines.append(f"and {len(failed) - _MOST_REASONS:,} more (--json has them all)")
+    runs = [_plain(found, member, state) for member, state in states]
+    print_result({"sweep_dir": str(found.path), "counts": dict(counted), "runs": runs}, as_json, lines)
+    return 0
+
+
+def _plain(found: Sweep, member: Member, state: RunState) -> dict[str, Any]:
+    return {
+        "seed": member.seed,
+        "options": dict(member.options),
+        "state": state.state,
+        "reason": state.reason or None,
+        "run_dir": str(found.path / member.name),
+        "parameters_sha256": state.summary.get("parameters_sha256"),
+    }

@@ -1,0 +1,240 @@
+"""What makes the runs of a sweep, whatever machines it has, and the loop that hands them out.
+
+Nothing is remembered between one time and the next but what the run folders say, so that a loop that was killed is
+begun again and goes on. A run whose process died without a word (killed, out of memory) is begun again from its newest
+checkpoint, three times at most without a new one in between.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from neuralq.runs.folder.files import FolderLock, RunFolderError, to_json, write_durably
+from neuralq.runs.play_off import score_of
+from neuralq.runs.stop_request import StopRequest
+from neuralq.runs.sweep.folder import Member, Sweep
+from neuralq.runs.sweep.results import RunResult, Status, SweepResult
+from neuralq.runs.sweep.states import RunState, note_failure, saved_steps, steps_so_far
+from neuralq.runs.sweep.work import Task
+
+__all__ = ["Ended", "Engine", "run_sweep", "share_of"]
+
+_POLL_SECONDS = 0.25
+_ELSEWHERE_SECONDS = 2.0
+"""Between looks at runs that another process is at."""
+_MOST_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A task that an engine is through with.
+
+    Args:
+        task: which.
+        reason: "" where the run ended by itself or was asked to; what happened to its process otherwise.
+    """
+
+    task: Task
+    reason: str = ""
+
+
+class Engine(Protocol):
+    """What makes runs. A run that it knows will fail again gets its failure noted (`note_failure`) by the engine."""
+
+    @property
+    def title(self) -> str:
+        """For people: "2 processes on this machine"."""
+        ...
+
+    def has_room(self) -> bool:
+        """Whether another task may be started now."""
+        ...
+
+    def start(self, task: Task) -> None:
+        """Begin a task.
+
+        Raises:
+            OSError: if it cannot be begun; others may.
+        """
+        ...
+
+    def collect(self, seconds: float) -> list[Ended]:
+        """What has ended since the last call, as soon as something has, and after so many seconds at the latest."""
+        ...
+
+    def running(self) -> list[Task]:
+        """Tasks that were started and have not been collected."""
+        ...
+
+    def stop(self) -> None:
+        """Ask every task to save and end, once."""
+        ...
+
+    def close(self) -> None:
+        """End at once whatever is left; no process stays behind."""
+        ...
+
+
+def share_of(sweep: Sweep, index: int = 0, of: int = 1) -> list[Member]:
+    """The runs of a sweep that belong to one of several that divide it between them.
+
+    Raises:
+        ValueError: if there is no such share.
+
+    Example:
+        >>> from pathlib import Path
+        >>> [member.seed for member in share_of(Sweep(Path(), {"total_steps": 1}, (0, 1, 2, 3, 4)), 1, 2)]
+        [1, 3]
+    """
+    if not 0 <= index < of:
+        raise ValueError(f"there are the shares 0 to {of - 1} of {of}, got {index}")
+    return [member for number, member in enumerate(sweep.members()) if number % of == index]
+
+
+def run_sweep(
+    sweep: Sweep,
+    engine: Engine,
+    watch: Callable[[Status], None] | None = None,
+    retry_failed: bool = True,
+    members: Iterable[Member] | None = None,
+) -> SweepResult:
+    """Make every run that has not finished; one that fails is named and the others go on.
+
+    SIGINT, SIGTERM and SIGUSR1 are passed on to the runs, which save and end; a second one ends them at once.
+
+    Args:
+        sweep: which.
+        engine: makes the runs; closed in any case.
+        watch: told how far it has come, a few times a second.
+        retry_failed: whether runs that have failed before are begun again.
+        members: some of its runs; all by default, which one process at a time may ask for.
+
+    Raises:
+        RunFolderBusy: if another process is running the whole sweep.
+    """
+    request, whole = StopRequest(), members is None
+    with contextlib.ExitStack() as stack:
+        stack.callback(engine.close)
+        if whole:
+            busy = f"the sweep in {sweep.path} is being run"
+            stack.enter_context(contextlib.closing(FolderLock(sweep.path / "sweep.lock", busy)))
+        stack.enter_context(request.listening())
+        loop = _Loop(sweep, engine, list(sweep.members() if members is None else members), retry_failed)
+        told = -math.inf
+        while loop.waiting or loop.elsewhere or engine.running():
+            if request.name is not None:
+                loop.stop()
+            loop.hand_out()
+            loop.collect(_POLL_SECONDS)
+            if watch is not None and time.monotonic() - told > _POLL_SECONDS:
+                told = time.monotonic()
+                watch(loop.status())
+        if watch is not None:
+            watch(loop.status())
+        engine.close()
+        result = SweepResult(tuple(loop.result(member) for member in loop.members), request.name)
+        if whole:
+            write_durably(sweep.path / "summary.json", to_json(result.plain(), "summary", sealed=True))
+    return result
+
+
+class _Loop:
+    """Which runs wait, which another process is at, and what is known of the others."""
+
+    def __init__(self, sweep: Sweep, engine: Engine, members: list[Member], retry_failed: bool) -> None:
+        self.sweep, self.engine, self.members = sweep, engine, members
+        self.by_name = {member.name: member for member in members}
+        self.states = {member.name: sweep.state(member) for member in members}
+        passed = ("finished",) if retry_failed else ("finished", "failed")
+        self.waiting = deque(m for m in members if self.states[m.name].state not in passed)
+        self.elsewhere: list[Member] = []
+        self.attempts: dict[str, tuple[int, int]] = {}
+        self.stopping = False
+        self._looked = time.monotonic()
+        self._steps = {name: int(sweep.configuration(self.by_name[name])["total_steps"]) for name in self.by_name}
+
+    def stop(self) -> None:
+        """Nothing new is begun, and what goes on is asked to end."""
+        self.waiting.clear()
+        self.elsewhere.clear()
+        if not self.stopping:
+            self.engine.stop()
+        self.stopping = True
+
+    def hand_out(self) -> None:
+        if self.elsewhere and time.monotonic() - self._looked > _ELSEWHERE_SECONDS:
+            self._looked = time.monotonic()
+            self.waiting.extend(self.elsewhere)
+            self.elsewhere.clear()
+        while self.waiting and self.engine.has_room():
+            member = self.waiting.popleft()
+            state = self.sweep.state(member)
+            if state.state == "finished":  # meanwhile, by another process
+                self.states[member.name] = state
+            elif state.state == "running":
+                self.elsewhere.append(member)
+            else:
+                self._start(member)
+
+    def _start(self, member: Member) -> None:
+        self.states[member.name] = RunState("running")
+        try:
+            self.engine.start(self.sweep.task(member))
+        except (OSError, RunFolderError, ValueError) as error:  # no room for a process or a log: this run's alone
+            self._fail(member, str(error))
+
+    def collect(self, seconds: float) -> None:
+        for ended in self.engine.collect(seconds):
+            member = self.by_name[ended.task.name]
+            state = self.sweep.state(member)
+            if state.state in ("finished", "failed") or self.stopping:
+                self.states[member.name] = state
+                continue
+            saved, before = saved_steps(ended.task.path), self.attempts.get(member.name, (-1, 0))
+            self.attempts[member.name] = (saved, before[1] + 1 if saved == before[0] else 1)
+            if state.state == "running":  # somebody else was there first
+                self.elsewhere.append(member)
+            elif self.attempts[member.name][1] >= _MOST_ATTEMPTS:
+                self._fail(member, f"{ended.reason or 'it ended before its end'}, {_MOST_ATTEMPTS} times over")
+            else:
+                self.states[member.name] = state
+                self.waiting.append(member)
+
+    def _fail(self, member: Member, reason: str) -> None:
+        note_failure(self.sweep.path / member.name, reason)
+        self.states[member.name] = RunState("failed", reason)
+
+    def result(self, member: Member) -> RunResult:
+        state = self.states[member.name]
+        if state.state in ("running", "stopped", "not begun"):
+            state = self.sweep.state(member)
+        if state.state not in ("finished", "failed"):
+            state = RunState("stopped")
+        path = self.sweep.path / member.name
+        return RunResult(member.seed, path, state.state, state.reason, state.summary, member.options)
+
+    def status(self) -> Status:
+        running = {task.name: task.path for task in self.engine.running()}
+        ended = {name: state for name, state in self.states.items() if name not in running}
+        finished = [name for name, state in ended.items() if state.state == "finished"]
+        steps = sum(self._steps[name] for name in finished)
+        steps += sum(min(self._steps[name], steps_so_far(path)) for name, path in running.items())
+        steps += sum(
+            min(self._steps[name], steps_so_far(self.sweep.path / name))
+            for name, state in ended.items() if state.state == "stopped"
+        )  # fmt: skip
+        scores = {name: score_of(ended[name].summary) for name in finished}
+        return Status(
+            env_steps=steps,
+            total_steps=sum(self._steps.values()),
+            running=tuple(running),
+            num_finished=len(finished),
+            failed=tuple(name for name, state in ended.items() if state.state == "failed"),
+            returns={name: score.mean for name, score in scores.items() if score is not None},
+        )
