@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
+from neuralq.apps.cli import main
 from neuralq.runs.sweep.scripts import kubernetes_job, num_shares, slurm_script
 
 
@@ -145,3 +147,40 @@ def test_a_job_is_what_the_schema_of_kubernetes_says() -> None:
         assert validate.validate(job_of(), version, strict=True) == version
     with pytest.raises(validate.ValidationError):
         validate.validate(job_of() | {"spec": {"completionmode": "Indexed"}}, "1.31", strict=True)
+
+
+ASKED = "{env: CartPole-v1, total_steps: 500, evaluation_episodes: 2, learning_rate: [1e-3, 1e-2], seeds: 2}"
+
+
+def test_the_command_prints_what_a_scheduler_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "asked.yaml").write_text(ASKED)
+    words = ["sweep", str(tmp_path / "asked.yaml"), str(tmp_path / "there")]
+    assert main([*words, "--slurm-script"]) == 0
+    assert "#SBATCH --array=0-3\n" in capsys.readouterr().out
+    assert main([*words[:1], words[2], "--slurm-script", "--of", "2"]) == 0
+    assert "--of 2 &\n" in capsys.readouterr().out
+    for wrong in (["--slurm-script", "--of", "5"], ["--kubernetes-job"]):
+        assert main([*words, *wrong]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert main([*words, "--kubernetes-job", "--image", "registry/neuralq:1", "--claim", "mine"]) == 0
+    job = yaml.safe_load(capsys.readouterr().out)
+    assert job["spec"]["completions"] == 4
+    assert job["spec"]["template"]["spec"]["volumes"][0]["persistentVolumeClaim"] == {"claimName": "mine"}
+
+
+@pytest.mark.slow
+def test_what_the_pods_of_a_job_do_is_the_whole_sweep(tmp_path: Path) -> None:
+    """Each index's command line, where the claim would be."""
+    (tmp_path / "asked.yaml").write_text(ASKED)
+    begin = [sys.executable, "-m", "neuralq"]
+    words = ["sweep", "asked.yaml", "there", "--kubernetes-job", "--image", "x", "--of", "3"]
+    printed = subprocess.run([*begin, *words], cwd=tmp_path, capture_output=True, check=True)
+    [container] = yaml.safe_load(printed.stdout)["spec"]["template"]["spec"]["containers"]
+    assert container["command"] == ["neuralq"]
+    for index in range(3):
+        args = [word.replace("$(JOB_COMPLETION_INDEX)", str(index)) for word in container["args"]]
+        args = [word.replace("/sweeps", str(tmp_path)) for word in args]
+        subprocess.run([*begin, *args], check=True, capture_output=True)
+        states = subprocess.run([*begin, "sweep", "there", "--status", "--json"], cwd=tmp_path, capture_output=True)
+        counts = json.loads(states.stdout.splitlines()[-1])["counts"]
+        assert counts.get("finished", 0) == (2, 3, 4)[index]

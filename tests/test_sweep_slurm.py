@@ -67,8 +67,11 @@ class Slurm:
         (root / "munge.key").chmod(0o600)
         for name in ("state", "spool"):
             (root / name).mkdir()
-        self.env = {**os.environ, "SLURM_CONF": str(root / "slurm.conf"), "OMP_NUM_THREADS": "1"}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    @property
+    def env(self) -> dict[str, str]:
+        return {**os.environ, "SLURM_CONF": str(self.root / "slurm.conf"), "OMP_NUM_THREADS": "1"}
 
     def start(self, name: str, *words: str) -> None:
         with open(self.root / f"{name}.log", "ab") as log:
@@ -159,14 +162,14 @@ def bits(folder: Path) -> dict[tuple[str, int], str]:
     return {(json.dumps(run["options"]), run["seed"]): run["parameters_sha256"] for run in runs}
 
 
-def ask_for(folder: Path, total_steps: int, rates: Any, seeds: int) -> Path:
-    asked = {"env": "CartPole-v1", "total_steps": total_steps, "learning_rate": rates, "seeds": seeds}
+def ask_for(folder: Path, **options: Any) -> Path:
+    asked = {"env": "CartPole-v1", "learning_rate": 1e-3, **options}
     (folder / "asked.yaml").write_text(json.dumps(asked))
     return folder / "asked.yaml"
 
 
 def test_the_printed_script_gives_the_bits_of_local_processes(slurm: Slurm, tmp_path: Path) -> None:
-    asked = ask_for(tmp_path, 5000, [3e-4, 1e-3, 3e-3], 8)
+    asked = ask_for(tmp_path, total_steps=5000, learning_rate=[3e-4, 1e-3, 3e-3], seeds=8)
     neuralq("sweep", asked, tmp_path / "here", "--workers", 2)
     script = neuralq("sweep", asked, tmp_path / "a folder", "--slurm-script")
     states = slurm.wait(slurm.submit(script, "--time=10"), 600)
@@ -175,13 +178,33 @@ def test_the_printed_script_gives_the_bits_of_local_processes(slurm: Slurm, tmp_
     assert len(list((tmp_path / "a folder").glob("slurm-*_*.log"))) == 24
 
 
+SLOW = """
+import time
+import gymnasium
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+
+class SlowCart(CartPoleEnv):
+    def step(self, action):
+        time.sleep(.004)
+        return super().step(action)
+
+gymnasium.register("SlowCart-v0", SlowCart, max_episode_steps=500)
+"""
+
+
 @pytest.fixture(scope="module")
-def long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[tuple[str, int], str]]:
-    """A sweep of two runs of a minute or more, and what they end with."""
+def long(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[tuple[str, int], str]]]:
+    """A sweep of two runs of a minute and a half, most of it slept through, and what they end with."""
     folder = tmp_path_factory.mktemp("long")
-    asked = ask_for(folder, 1_000_000, 1e-3, 2)
-    neuralq("sweep", asked, folder / "here")
-    return asked, bits(folder / "here")
+    (folder / "slow_cart.py").write_text(SLOW)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", f"{os.environ['PYTHONPATH']}{os.pathsep}{folder}")
+        asked = ask_for(
+            folder, env="slow_cart:SlowCart-v0", total_steps=20_000, checkpoint_every=2000, seeds=2,
+            evaluate_every=20_000, evaluation_episodes=1, resume_probe=False, threads=1,
+        )  # fmt: skip
+        neuralq("sweep", asked, folder / "here")
+        yield asked, bits(folder / "here")
 
 
 def test_a_task_whose_time_is_up_saves_and_queues_again(

@@ -15,12 +15,12 @@ import yaml  # type: ignore[import-untyped]
 
 from neuralq.checks import check_whole
 
-__all__ = ["MOST_SHARES", "WORK_IS_LEFT", "kubernetes_job", "num_shares", "slurm_script"]
+__all__ = ["MOST_SHARES", "REQUEUE", "kubernetes_job", "num_shares", "slurm_script"]
 
 MOST_SHARES = 1000
 """Shares at most, where nobody says how many: Slurm's MaxArraySize is 1001 unless a site raises it."""
-WORK_IS_LEFT = 75
-"""Exit status of a share that was asked to save and end: EX_TEMPFAIL of sysexits.h, "try again later"."""
+REQUEUE = 75
+"""Exit status of a share that was asked to end before its end: to be begun again (EX_TEMPFAIL of sysexits.h)."""
 _SECONDS_TO_SAVE = 120
 
 
@@ -107,8 +107,8 @@ while kill -0 "$share" 2>/dev/null; do wait "$share"; done
 wait "$share"
 status=$?
 
-# {WORK_IS_LEFT}: saved, and work is left. Killed by USR1 itself: asked before it could listen, nothing lost.
-if [ "$status" = {WORK_IS_LEFT} ] || {{ [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }}; then
+# {REQUEUE}: saved, and work is left. Killed by USR1 itself: asked before it could listen, nothing lost.
+if [ "$status" = {REQUEUE} ] || {{ [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }}; then
   if [ "$SECONDS" -lt 60 ] && [ "${{SLURM_RESTART_COUNT:-0}}" -ge 3 ]; then
     echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
   elif ! scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; then
@@ -124,7 +124,7 @@ def kubernetes_job(
 ) -> str:
     """A manifest for ``kubectl create -f``: an Indexed Job with one pod for each share of a sweep.
 
-    A pod that is evicted or preempted, and one that ended with `WORK_IS_LEFT`, is replaced and counts as no failure; a
+    A pod that is evicted or preempted, and one that ended with `REQUEUE`, is replaced and counts as no failure; a
     share that failed is not tried again, since its runs say why; one whose pod was killed, for memory perhaps, is tried
     three times more. Takes Kubernetes 1.31 or newer.
 
@@ -173,7 +173,7 @@ def kubernetes_job(
 def _job(shares: int, pod: dict[str, Any]) -> dict[str, Any]:
     rules = [
         {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget", "status": "True"}]},
-        {"action": "Ignore", "onExitCodes": {"operator": "In", "values": [WORK_IS_LEFT]}},
+        {"action": "Ignore", "onExitCodes": {"operator": "In", "values": [REQUEUE]}},
         {"action": "FailIndex", "onExitCodes": {"operator": "In", "values": [1, 2]}},
     ]
     return {
