@@ -158,7 +158,7 @@ def test_the_command_prints_what_a_scheduler_is_given(tmp_path: Path, capsys: py
     assert main([*words, "--slurm-script"]) == 0
     assert "#SBATCH --array=0-3\n" in capsys.readouterr().out
     assert main([*words[:1], words[2], "--slurm-script", "--of", "2"]) == 0
-    assert "--of 2 &\n" in capsys.readouterr().out
+    assert "--of 2\n" in capsys.readouterr().out
     for wrong in (["--slurm-script", "--of", "5"], ["--kubernetes-job"]):
         assert main([*words, *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1

@@ -22,6 +22,29 @@ MOST_SHARES = 1000
 REQUEUE = 75
 """Exit status of a share that was asked to end before its end: to be begun again (EX_TEMPFAIL of sysexits.h)."""
 _SECONDS_TO_SAVE = 120
+_WATCHED = """\
+# The shell hears that its time is up, the command does not: pass it on. A trap cuts "wait" short.
+asked=
+share=
+trap 'asked=yes; [ -z "$share" ] || kill -USR1 "$share" 2>/dev/null' USR1
+share_of_the_runs &
+share=$!
+[ -z "$asked" ] || kill -USR1 "$share"
+wait "$share"
+while kill -0 "$share" 2>/dev/null; do wait "$share"; done
+wait "$share"
+status=$?
+
+# Killed by USR1 itself: asked before it could listen, and nothing lost.
+if [ "$status" = "$work_is_left" ] || { [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }; then
+  if [ "$SECONDS" -lt 60 ] && [ "${SLURM_RESTART_COUNT:-0}" -ge 3 ]; then
+    echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
+  elif ! scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; then
+    echo "could not be queued again: what is left is done by handing this script to sbatch once more" >&2
+  fi
+fi
+exit "$status"
+"""
 
 
 def num_shares(num_runs: int, asked: int | None = None) -> int:
@@ -94,29 +117,11 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
 #SBATCH --output="{log}"
 
 export OMP_NUM_THREADS={num_threads}
-
-# The shell hears that its time is up, the command does not: pass it on. A trap cuts "wait" short.
-asked=
-share=
-trap 'asked=yes; [ -z "$share" ] || kill -USR1 "$share" 2>/dev/null' USR1
-{shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares} &
-share=$!
-[ -z "$asked" ] || kill -USR1 "$share"
-wait "$share"
-while kill -0 "$share" 2>/dev/null; do wait "$share"; done
-wait "$share"
-status=$?
-
-# {REQUEUE}: saved, and work is left. Killed by USR1 itself: asked before it could listen, nothing lost.
-if [ "$status" = {REQUEUE} ] || {{ [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }}; then
-  if [ "$SECONDS" -lt 60 ] && [ "${{SLURM_RESTART_COUNT:-0}}" -ge 3 ]; then
-    echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
-  elif ! scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; then
-    echo "could not be queued again: what is left is done by handing this script to sbatch once more" >&2
-  fi
-fi
-exit "$status"
-"""
+work_is_left={REQUEUE}
+share_of_the_runs() {{
+  exec {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares}
+}}
+{_WATCHED}"""
 
 
 def kubernetes_job(
