@@ -165,6 +165,20 @@ def test_what_decides_the_bits_and_differs_is_named_and_the_promise_is_taken_bac
     assert f"{name} was {value} and is" in run.resumability
 
 
+def test_a_processor_that_lacks_something_is_named_and_older_checkpoints_lack_nothing() -> None:
+    here = origin.present({})
+    there = {**here, "arithmetic": {**here["arithmetic"], "features of the processor": "avx avx512f fma"}}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            origin, "_arithmetic", lambda *_: {**there["arithmetic"], "features of the processor": "avx fma sse"}
+        )
+        told = "the run is bit-exact on processors of the kind it was on; this one lacks avx512f and has sse beside"
+        assert origin.compared(there, {}, "it") == told
+        named = ("features of the processor", "C library", "instructions of NumPy")
+        older = {n: value for n, value in there["arithmetic"].items() if n not in named}
+        assert origin.compared({**there, "arithmetic": older}, {}, "it") is None
+
+
 def test_the_promise_says_how_far_it_was_tried(finished: Run) -> None:
     assert finished.resumability.startswith("resumes bit-exact as far as 60 steps show")  # 50, and 10 after a reset
 

@@ -29,11 +29,9 @@ from neuralq.runs.sweep import (
     read_asked,
     share_of,
 )
+from neuralq.runs.sweep.scripts import REQUEUE, kubernetes_job, num_shares, slurm_script
 
-__all__ = ["REQUEUE", "sweep"]
-
-REQUEUE = 75
-"""Exit status of a share that was asked to end before its end: to be begun again (EX_TEMPFAIL of sysexits.h)."""
+__all__ = ["sweep"]
 
 _MOST_REASONS = 20
 
@@ -44,11 +42,14 @@ def sweep(argv: list[str]) -> int:
     *file, folder = options.what
     if len(file) > 1:
         raise Failure(f"a file and a folder, two words at most, got {' '.join(options.what)}", 2)
-    if options.of is not None and options.index is None:
+    if options.of is not None and options.index is None and not (options.slurm_script or options.kubernetes_job):
         raise Failure("--of says how many shares there are; add --index, which one to make", 2)
     found = _asked_for(file[0], folder, options) if file else _there(folder)
     if options.status:
         return _status(found, options.json)
+    if options.slurm_script or options.kubernetes_job:
+        print(_script(found, options), end="")
+        return 0
     members = None if options.index is None else share_of(found, options.index, options.of or len(found))
     engine = _engine(found, options)
     if members is None:
@@ -74,6 +75,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--retry-failed", action="store_true", help="begin runs again that have failed")
     parser.add_argument("--index", type=int, metavar="I", help="make one share of the runs, counted from 0")
     parser.add_argument("--of", type=int, metavar="N", help="how many shares there are (default: one for each run)")
+    script = parser.add_mutually_exclusive_group()
+    script.add_argument(
+        "--slurm-script", action="store_true",
+        help="print a script for sbatch, a task for each share, which queues again when its time was up; make no run",
+    )  # fmt: skip
+    script.add_argument(
+        "--kubernetes-job", action="store_true",
+        help="print an Indexed Job for kubectl create, a pod for each share; make no run",
+    )  # fmt: skip
+    parser.add_argument("--image", default="", metavar="NAME", help="container image for --kubernetes-job")
+    parser.add_argument(
+        "--claim", default="neuralq-sweeps", metavar="NAME",
+        help="PersistentVolumeClaim of --kubernetes-job, with DIR at its root (default: neuralq-sweeps)",
+    )  # fmt: skip
     parser.add_argument(
         "--hook", action="append", default=[], metavar="module:name", help="watches each run, as for neuralq train"
     )
@@ -115,6 +130,19 @@ def _numbers(value: Any) -> Any:
         return [_numbers(inner) for inner in value]
     is_written = isinstance(value, str) and re.fullmatch(r"[\d._]*\d[\d._]*[kKMG]", value, re.ASCII)
     return any_number(value) if is_written else value
+
+
+def _script(found: Sweep, options: argparse.Namespace) -> str:
+    """What a scheduler is to be given; its shares are as many as are asked for, or as there are runs."""
+    config = found.configuration(next(found.members()))
+    threads, gpus = int(config.get("threads", 1)), int(str(config.get("device", "cpu")).startswith("cuda"))
+    try:
+        shares = num_shares(len(found), options.of)
+        if options.slurm_script:
+            return slurm_script(found.path, shares, threads, gpus)
+        return kubernetes_job(found.path, shares, options.image, options.claim, threads, gpus)
+    except ValueError as error:
+        raise Failure(str(error), 2) from error
 
 
 def _there(folder: str) -> Sweep:

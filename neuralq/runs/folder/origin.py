@@ -7,9 +7,12 @@ all of it; what differs is named, and what may not differ is refused.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
+import platform
+import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -20,7 +23,13 @@ __all__ = ["ARITHMETIC", "compared", "flat_names", "present"]
 
 ARITHMETIC = frozenset(("device", "engine", "threads"))
 """Fields of configurations that say how to compute, and not what."""
-_VARIABLES = ("MKL_CBWR", "MKL_ENABLE_INSTRUCTIONS", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_JIT")
+_VARIABLES = ("MKL_CBWR", "MKL_ENABLE_INSTRUCTIONS", "NUMBA_DISABLE_JIT", "ONEDNN_MAX_CPU_ISA")
+_FEATURES, _LIBC, _NUMPY = "features of the processor", "C library", "instructions of NumPy"
+_SINCE = frozenset((_FEATURES, _LIBC, _NUMPY))
+"""What older checkpoints did not keep: a difference to nothing is none."""
+_CALCULATES = re.compile(r"avx|sse|fma|f16c|amx|xop|neon|sve|sme|fp|bf16|i8mm|dotprod")
+_CHOSEN = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "MKL_CBWR", "ONEDNN_MAX_CPU_ISA")
+"""Where all of these are set, nothing asks the processor for more than is kept under other names (docs/scale.md)."""
 
 
 def present(config: Mapping[str, Any], free: Collection[str] = ()) -> dict[str, Any]:
@@ -50,6 +59,7 @@ def _versions() -> dict[str, str]:
 def _arithmetic(device: str) -> dict[str, str]:
     """What decides the bits beside versions, by name."""
     import llvmlite.binding
+    import numpy as np
     import torch
     from threadpoolctl import threadpool_info
 
@@ -58,8 +68,18 @@ def _arithmetic(device: str) -> dict[str, str]:
         for library in threadpool_info()
         if library["user_api"] == "blas" and "scipy.libs" not in library["filepath"]  # loaded now or later
     }
+    simd: Any = np.show_config(mode="dicts")
+    found[_NUMPY] = " ".join(simd.get("SIMD Extensions", {}).get("found", ()))
+    found[_LIBC] = " ".join(platform.libc_ver())
     found["instructions of torch"] = torch.backends.cpu.get_cpu_capability()
-    found["processor that kernels are compiled for"] = llvmlite.binding.get_host_cpu_name()
+    name = os.environ.get("NUMBA_CPU_NAME")
+    found["processor that kernels are compiled for"] = name or llvmlite.binding.get_host_cpu_name()
+    if any(name not in os.environ for name in _CHOSEN):
+        with contextlib.suppress(RuntimeError):  # not to be found out
+            features = llvmlite.binding.get_host_cpu_features()
+            found[_FEATURES] = " ".join(sorted(n for n, has in features.items() if has and _CALCULATES.search(n)))
+    if "NUMBA_CPU_FEATURES" in os.environ:
+        found["features that kernels are compiled for"] = os.environ["NUMBA_CPU_FEATURES"]
     if device != "cpu":
         cuda = device.startswith("cuda") and torch.cuda.is_available()
         found["accelerator"] = torch.cuda.get_device_name(device) if cuda else device
@@ -100,8 +120,18 @@ def compared(
     changed = {n: (then_config[n], now_config.get(n)) for n in differing if n in ARITHMETIC}
     for part in ("versions", "arithmetic"):
         then, here = dict(saved[part]), dict(now[part])
-        changed |= {n: (then.get(n), here.get(n)) for n in {**then, **here} if then.get(n) != here.get(n)}
-    return ", ".join(f"{name} was {then} and is {here}" for name, (then, here) in changed.items()) or None
+        known = [n for n in {**then, **here} if n not in _SINCE or (n in then and n in here)]
+        changed |= {n: (then.get(n), here.get(n)) for n in known if then.get(n) != here.get(n)}
+    return ", ".join(_told(name, then, here) for name, (then, here) in changed.items()) or None
+
+
+def _told(name: str, then: Any, here: Any) -> str:
+    if name != _FEATURES:
+        return f"{name} was {then} and is {here}"
+    before, now = set(then.split()), set(here.split())
+    told = "the run is bit-exact on processors of the kind it was on; this one "
+    lacks, has = (" ".join(sorted(names)) for names in (before - now, now - before))
+    return told + " and ".join(filter(None, (lacks and f"lacks {lacks}", has and f"has {has} beside")))
 
 
 def flat_names(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
