@@ -23,7 +23,6 @@ import pytest
 
 from neuralq import train, with_preset
 from neuralq.apps.cli import main, sweeps
-from neuralq.apps.cli.sweep import REQUEUE
 from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs.folder.files import FolderLock, read_json
 from neuralq.runs.folder.run_folder import RunFolderBusy, RunFolderError, read_metrics, read_summary
@@ -45,6 +44,7 @@ from neuralq.runs.sweep import (
     state_of,
 )
 from neuralq.runs.sweep import engine as engine_module
+from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.states import forget_failure, note_failure
 
 CONFIG = {"env": "CartPole-v1", "total_steps": 1000, "threads": 1}
@@ -504,7 +504,7 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def made_by(monkeypatch: pytest.MonkeyPatch, **behaviours: str) -> Pretender:
     engine = Pretender(**behaviours)  # type: ignore[arg-type]  # none is the number of processes
-    monkeypatch.setattr("neuralq.apps.cli.sweep.LocalProcesses", lambda *_: engine)
+    monkeypatch.setattr("neuralq.apps.cli.sweeps.LocalProcesses", lambda *_: engine)
     return engine
 
 

@@ -37,7 +37,9 @@ from neuralq.runs.sweep import (
     is_sweep_folder,
     open_sweep,
     run_sweep,
+    share_of,
 )
+from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.runs.trust import refuse_strangers
 
@@ -45,6 +47,8 @@ __all__ = [
     "a_configuration",
     "add_trust",
     "add_which",
+    "engine_of",
+    "make_runs",
     "refuse_other_kinds",
     "resume_seeds",
     "run_to_the_end",
@@ -162,6 +166,19 @@ def refuse_other_kinds(path: str | Path) -> None:
     name = kind_in(path)
     if name is not None and (command := kind_named(name).command) is not None:
         raise Failure(f"{path} is {kind_named(name).title}, which is {command.instead.format(run=path)}", 2)
+
+
+def make_runs(sweep: Sweep, options: argparse.Namespace) -> int:
+    """What ``neuralq sweep`` was asked for beside telling how far a sweep is: its runs, or a share of them."""
+    members = None if options.index is None else share_of(sweep, options.index, options.of or len(sweep))
+    again = options.retry_failed
+    status = run_to_the_end(sweep, engine_of(sweep, options), options.json, members=members, retry_failed=again)
+    return REQUEUE if members is not None and status > 128 else status
+
+
+def engine_of(sweep: Sweep, options: argparse.Namespace) -> Engine:
+    """What makes the runs, as the options of ``neuralq sweep`` say."""
+    return LocalProcesses(options.workers, sweep.configuration(next(sweep.members())))
 
 
 def run_to_the_end(
