@@ -126,11 +126,19 @@ def _read(file: str) -> Asked:
 def _numbers(value: Any) -> Any:
     """With 100k and 2.5M, which YAML has no word for, as numbers."""
     if isinstance(value, dict):
-        return {name: _numbers(inner) for name, inner in value.items()}
+        return {name: _widths(inner) if name == "hidden" else _numbers(inner) for name, inner in value.items()}
     if isinstance(value, list):
         return [_numbers(inner) for inner in value]
     is_written = isinstance(value, str) and re.fullmatch(r"[\d._]*\d[\d._]*[kKMG]", value, re.ASCII)
     return any_number(value) if is_written else value
+
+
+def _widths(value: Any) -> Any:
+    """Of hidden layers, which may be written as on the command line, 64,64; a list of such is several networks."""
+    if isinstance(value, list) and any(isinstance(one, str) for one in value):
+        return [_widths(one) for one in value]
+    is_written = isinstance(value, str) and re.fullmatch(r"[\d,\s]*\d[\d,\s]*", value, re.ASCII)
+    return [int(width) for width in re.findall(r"\d+", value)] if is_written else value
 
 
 def _script(found: Sweep, options: argparse.Namespace) -> str:
