@@ -56,6 +56,8 @@ def test_an_attempt_begins_from_the_newest_whole_checkpoint_of_all_before_it(tmp
     assert state_of(path).state == "not begun"
     advance(first, 10, 20, 30)
     assert state_of(path).state == "stopped"
+    with RunFolder.open(first):
+        assert state_of(path).state == "running"
     second = begun(path)  # the first is given up, and goes on all the same
     assert (second.name, saved_steps(second), rows(second)) == ("2", 30, [10, 20, 30])
     assert np.array_equal(checkpoint.load_newest(second / "checkpoints").state["values"], np.full(3, 30))

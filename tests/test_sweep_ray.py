@@ -136,8 +136,9 @@ def test_what_is_no_cluster_is_said_at_once(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("storage", ["shared", "none"])
-def test_a_node_without_neuralq_is_one_line(tmp_path: Path, storage: str) -> None:
+def test_a_node_without_neuralq_is_one_line(tmp_path: Path, storage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray", reason="the extra ray is not installed")
+    monkeypatch.chdir(tmp_path)  # workers look into the folder of the command, too
     from ray.cluster_utils import Cluster
 
     (tmp_path / "lacks" / "neuralq").mkdir(parents=True)
