@@ -299,4 +299,17 @@ ROLLOUT = LearnerKind(
     place=1,
     step_sizes=("learning_rate",),
     on_table=_on_table,
+    space={
+        "learning_rate": {"from": 1e-4, "to": 5e-3, "scale": "log"},
+        "lambda_": {"from": 0.3, "to": 1.0},
+        "num_envs": [8, 16, 32],
+        "num_steps": [16, 32, 64, 128],
+        "num_epochs": {"from": 1, "to": 12, "scale": "log"},
+        "num_minibatches": [4, 8, 16, 32],
+        "anneal": [True, False],
+        "refresh_targets": [True, False],
+        "average_updates": {"from": 2.0, "to": 64.0, "scale": "log", "or": None},
+        "normalise_observations": [True, False],
+    },
+    updates_per_step=lambda s: s.num_epochs * s.num_minibatches / (s.num_envs * s.num_steps),
 )

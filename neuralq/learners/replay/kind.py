@@ -119,4 +119,15 @@ REPLAY = LearnerKind(
     place=2,
     step_sizes=("learning_rate", "dqrc_learning_rate"),
     on_table=_on_table,
+    space={
+        "learning_rate": {"from": 1e-4, "to": 5e-3, "scale": "log"},
+        "target_rule": ["q_learning", "double"],
+        "num_steps": {"from": 1, "to": 10, "scale": "log"},
+        "batch_size": [32, 64, 128, 256],
+        "train_period": [1, 2, 4, 8],
+        "target_rate": {"from": 0.002, "to": 0.05, "scale": "log", "or": None},
+        "target_period_updates": {"from": 50, "to": 2_000, "scale": "log", "when": {"target_rate": None}},
+        "average_updates": {"from": 100.0, "to": 10_000.0, "scale": "log", "or": None},
+    },
+    updates_per_step=lambda s: s.updates_per_period / s.train_period,
 )
