@@ -73,6 +73,13 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
+def _loss(settings: ReplaySettings) -> Loss:
+    """Of a mean; distributions have losses of their own."""
+    if settings.loss != "huber":
+        return Loss("squared")
+    return Loss("huber") if settings.huber_delta is None else Loss("huber", settings.huber_delta)
+
+
 def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
     """Plain steps that bring an entry a twentieth nearer to each of its samples, all of them kept; an average plays.
 
@@ -112,7 +119,7 @@ REPLAY = LearnerKind(
         replay=True,
         double=s.rule is DOUBLE,
     ),
-    loss=lambda s: Loss("huber" if s.loss == "huber" else "squared"),
+    loss=_loss,
     outputs=lambda s, layout: s.returns.outputs(s, layout),
     represent=_represented,
     check=_check,
