@@ -88,7 +88,7 @@ def test_a_task_without_time_to_work_does_not_queue_for_ever(place: Path) -> Non
 def test_the_script_is_sound_and_its_words_arrive_whole(place: Path) -> None:
     perform(place, "exit 0")
     words = (place.parent / "words").read_text().splitlines()
-    assert words == ["-m", "neuralq", "sweep", str(place), "--index", "3", "--of", "24"]
+    assert words == ["-m", "neuralq", "sweep", str(place), "--index", "3", "--of", "24", "--workers", "1"]
     script = place.parent / "script"
     subprocess.run(["bash", "-n", str(script)], check=True)
     if shutil.which("shellcheck"):
@@ -134,7 +134,7 @@ def test_a_job_of_kubernetes_tells_what_is_lost_from_what_failed() -> None:
     assert container["resources"]["limits"] == {"memory": "2Gi", "nvidia.com/gpu": "1"}
     # As the kubelet writes it (k8s.io/kubernetes/third_party/forked/golang/expansion): "$(X)" is X, "$$" is "$".
     words = [word.replace("$(JOB_COMPLETION_INDEX)", "2").replace("$$", "$") for word in container["args"]]
-    assert words == ["sweep", "/sweeps/a $(HOSTNAME) sweep", "--index", "2", "--of", "3"]
+    assert words == ["sweep", "/sweeps/a $(HOSTNAME) sweep", "--index", "2", "--of", "3", "--workers", "1"]
     with pytest.raises(ValueError, match="--image"):
         kubernetes_job("/data", 3, " ")
 
@@ -158,7 +158,7 @@ def test_the_command_prints_what_a_scheduler_is_given(tmp_path: Path, capsys: py
     assert main([*words, "--slurm-script"]) == 0
     assert "#SBATCH --array=0-3\n" in capsys.readouterr().out
     assert main([*words[:1], words[2], "--slurm-script", "--of", "2"]) == 0
-    assert "--of 2\n" in capsys.readouterr().out
+    assert "--of 2 --workers 1\n" in capsys.readouterr().out
     for wrong in (["--slurm-script", "--of", "5"], ["--kubernetes-job"]):
         assert main([*words, *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1

@@ -1,7 +1,8 @@
 """What to hand to somebody else's scheduler: a batch script for Slurm, a Job for Kubernetes.
 
 Both run ``neuralq sweep DIR --index I --of N`` for every share I and leave queueing, limits and what happens to a lost
-node to the scheduler. Nothing but the run folders is state, so handing the file in again is the whole of recovery.
+node to the scheduler. A share has one run at a time, since a node has more cores than a task may use. Nothing but the
+run folders is state, so handing the file in again is the whole of recovery.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
 export OMP_NUM_THREADS={num_threads}
 work_is_left={REQUEUE}
 share_of_the_runs() {{
-  exec {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares}
+  exec {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares} --workers 1
 }}
 {_WATCHED}"""
 
@@ -147,7 +148,7 @@ def kubernetes_job(
     Example:
         >>> job = yaml.safe_load(kubernetes_job("runs/lr", 24, "registry/neuralq:1"))
         >>> job["spec"]["completions"], job["spec"]["template"]["spec"]["containers"][0]["args"]
-        (24, ['sweep', '/sweeps/lr', '--index', '$(JOB_COMPLETION_INDEX)', '--of', '24'])
+        (24, ['sweep', '/sweeps/lr', '--index', '$(JOB_COMPLETION_INDEX)', '--of', '24', '--workers', '1'])
     """
     if not image.strip():
         raise ValueError(
@@ -160,7 +161,7 @@ def kubernetes_job(
         "name": "share",
         "image": image,
         "command": ["neuralq"],
-        "args": ["sweep", folder, "--index", "$(JOB_COMPLETION_INDEX)", "--of", str(shares)],
+        "args": ["sweep", folder, "--index", "$(JOB_COMPLETION_INDEX)", "--of", str(shares), "--workers", "1"],
         "env": [{"name": "OMP_NUM_THREADS", "value": str(num_threads)}],
         "resources": {"requests": {"cpu": str(num_threads), **limits}, "limits": limits},
         "volumeMounts": [{"name": "sweeps", "mountPath": "/sweeps"}],
