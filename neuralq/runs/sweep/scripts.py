@@ -38,7 +38,7 @@ status=$?
 
 # Killed by USR1 itself: asked before it could listen, and nothing lost.
 if [ "$status" = "$work_is_left" ] || { [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }; then
-  if [ "$SECONDS" -lt 60 ] && [ "${SLURM_RESTART_COUNT:-0}" -ge 3 ]; then
+  if [ "$SECONDS" -lt 30 ] && [ "${SLURM_RESTART_COUNT:-0}" -ge 3 ]; then
     echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
   elif ! scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; then
     echo "could not be queued again: what is left is done by handing this script to sbatch once more" >&2
@@ -74,9 +74,9 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
     finished. A node that is lost, and a task that is preempted, are Slurm's to replace (``--requeue``). What the site
     wants beside it (``--time``, ``--partition``, ``--mem``) goes to ``sbatch``.
 
-    A task that is asked to end within a minute of its beginning queues again three times, not for ever. A task is named
-    by its array and its index: the last task of an array has the number of the whole array, so that its number alone
-    would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
+    A task that is asked to end within half a minute of its beginning queues again three times, not for ever. A task is
+    named by its array and its index: the last task of an array has the number of the whole array, so that its number
+    alone would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
 
     Args:
         path: of the sweep, where the nodes see it too.
