@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from neuralq import with_preset
+from neuralq import train, with_preset
 from neuralq.apps.cli import main, sweeps
 from neuralq.apps.cli.sweeps import sweep_bar
 from neuralq.runs.folder.files import FolderLock, read_json
@@ -43,6 +44,7 @@ from neuralq.runs.sweep import (
     state_of,
 )
 from neuralq.runs.sweep import engine as engine_module
+from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.states import forget_failure, note_failure
 
 CONFIG = {"env": "CartPole-v1", "total_steps": 1000, "threads": 1}
@@ -439,6 +441,31 @@ def test_wrong_usage_is_refused(argv: list[str], said: str, capsys: pytest.Captu
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.whole
+def test_processes_of_this_machine_make_the_runs_that_one_process_makes(asked: Path) -> None:
+    """Whatever a run was forked of, and whoever ran beside it: the bits of a process of its own."""
+    asked.write_text("env: CartPole-v1\ntotal_steps: 600\nlambda: [0.5, 0.9]\nhidden: [[8]]\nseeds: 2\n")
+    assert main(["sweep", "s.yaml", "d", "--workers", "2"]) == 0
+    sweep = open_sweep("d")
+    for member in sweep.members():
+        run = train(sweep.configuration(member), "alone/" + member.name, preset=False)
+        assert sweep.state(member).summary["parameters_sha256"] == run.parameters_sha256
+    assert not any(child.name.startswith("lambda") for child in multiprocessing.active_children())
+
+
+@pytest.mark.whole
+def test_what_fails_in_a_process_is_told_in_a_line_and_a_missing_environment_hurts_no_other(
+    asked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked.write_text("env: [CartPole-v1, no_such_package:Env-v0]\ntotal_steps: 600\nhidden: [[8]]\n")
+    assert main(["sweep", "s.yaml", "d", "--workers", "1"]) == 1
+    capsys.readouterr()
+    assert main(["sweep", "d", "--status", "--json"]) == 0
+    first, second = result_of(capsys)["runs"]
+    assert first["state"] == "finished" and second["state"] == "failed" and "no_such_package" in second["reason"]
+    assert second["reason"] in Path(second["run_dir"] + ".log").read_text()
+
+
 @pytest.mark.slow
 def test_a_killed_sweep_ends_with_the_bits_of_runs_that_were_never_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -462,3 +489,111 @@ def test_a_killed_sweep_ends_with_the_bits_of_runs_that_were_never_stopped(
         assert json.loads(capsys.readouterr().out)["parameters_sha256"] == run["parameters_sha256"]
         rows = [row["greedy_return"] for row in read_metrics(run["run_dir"]) if row["kind"] == "evaluation"]
         assert rows == [row["greedy_return"] for row in read_metrics(single) if row["kind"] == "evaluation"]
+
+
+FILE = "env: CartPole-v1\ntotal_steps: 1k\nlambda: [0.5, 0.9]\nhidden: [[8]]\nseeds: 2\n"
+
+
+@pytest.fixture
+def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that asks for a sweep, in the present folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.yaml").write_text(FILE)
+    return tmp_path / "s.yaml"
+
+
+def made_by(monkeypatch: pytest.MonkeyPatch, **behaviours: str) -> Pretender:
+    engine = Pretender(**behaviours)  # type: ignore[arg-type]  # none is the number of processes
+    monkeypatch.setattr("neuralq.apps.cli.sweeps.LocalProcesses", lambda *_: engine)
+    return engine
+
+
+def result_of(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(capsys.readouterr().out.splitlines()[-1])
+    return found
+
+
+@pytest.mark.usefixtures("asked")
+def test_the_command_makes_what_a_file_asks_for_and_tells_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_by(monkeypatch, s1="fail")
+    assert main(["sweep", "s.yaml", "d", "--json"]) == 1
+    assert [run["state"] for run in result_of(capsys)["runs"]] == ["finished", "finished", "failed", "failed"]
+    assert main(["sweep", "d", "--status", "--json"]) == 0
+    runs = result_of(capsys)["runs"]
+    assert [(run["seed"], run["options"], run["state"], run["parameters_sha256"]) for run in runs] == [
+        (0, {"lambda_": 0.5, "hidden": [8]}, "finished", "0" * 64),
+        (0, {"lambda_": 0.9, "hidden": [8]}, "finished", "0" * 64),
+        (1, {"lambda_": 0.5, "hidden": [8]}, "failed", None),
+        (1, {"lambda_": 0.9, "hidden": [8]}, "failed", None),
+    ]
+    assert main(["sweep", "s.yaml", "d", "--status"]) == 0
+    out = capsys.readouterr().out
+    assert "4 runs: 2 finished, 0 running, 0 stopped, 2 failed, 0 not begun" in out and "the world ended" in out
+    assert made_by(monkeypatch).asked == [] and main(["sweep", "d"]) == 1, "what has failed is left alone"
+    assert "2 of 4 runs failed, try again with: neuralq sweep d --retry-failed" in capsys.readouterr().err
+    again = made_by(monkeypatch)
+    assert main(["sweep", "d", "--retry-failed"]) == 0 and again.asked == [1, 1]
+    assert "side by side: neuralq compare d --by lambda\n" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_share_that_is_asked_to_end_says_that_it_is_to_be_begun_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_by(monkeypatch)
+    assert main(["sweep", "s.yaml", "d", "--index", "1", "--of", "2", "--json"]) == 0
+    assert [run["seed"] for run in result_of(capsys)["runs"]] == [0, 1]
+    engine = made_by(monkeypatch, others="wait")
+    start = engine.start
+    monkeypatch.setattr(engine, "start", lambda task: start(task) or os.kill(os.getpid(), signal.SIGUSR1))
+    assert main(["sweep", "d", "--index", "0"]) == REQUEUE == 75
+    assert engine.asked == [0]
+    assert main(["sweep", "d", "--index", "4"]) == 1 and "shares 0 to 3 of 4, got 4" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "words", "said"),
+    [
+        ("gamma: [0.9]", ["s.yaml", "d"], "s.yaml: a sweep needs an environment"),
+        ("env: CartPole-v1\nlamda: [0.9]", ["s.yaml", "d"], "did you mean"),
+        ("env: CartPole-v1\ngamma: [0.9, 2]", ["s.yaml", "d"], r"(with gamma 2)"),
+        ("env: CartPole-v1\nreplay.learning_rate: 1", ["s.yaml", "d"], "replay.learning_rate"),
+        ("- a", ["s.yaml", "d"], "must hold a mapping of options, got list"),
+        ("env: [", ["s.yaml", "d"], "cannot read s.yaml"),
+        (FILE, ["s.yaml"], "neuralq sweep s.yaml DIR"),
+        (FILE, ["none.yaml", "d"], "cannot read none.yaml"),
+        (FILE, ["d"], "there is no sweep in d; start one with: neuralq sweep FILE.yaml d"),
+        (FILE, ["s.yaml", "d", "--hook", "nothing"], "cannot import the hook"),
+        (FILE, ["s.yaml", "d", "e"], "two words at most"),
+        (FILE, ["s.yaml", "d", "--of", "3"], "--of says how many shares there are; add --index"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused_in_a_line(
+    asked: Path, content: str, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked.write_text(content)
+    assert main(["sweep", *words]) in (1, 2)
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and not Path("d").exists()
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_sweep_that_was_asked_for_otherwise_is_left_alone(
+    asked: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_by(monkeypatch)
+    assert main(["sweep", "s.yaml", "d"]) == 0
+    before = Path("d/sweep.json").read_bytes()
+    asked.write_text(FILE.replace("1k", "2k"))
+    assert main(["sweep", "s.yaml", "d"]) == 1
+    assert "total_steps: 1000 there, 2000 here" in capsys.readouterr().err
+    assert Path("d/sweep.json").read_bytes() == before
+    more = made_by(monkeypatch)
+    monkeypatch.setattr(sweeps, "LocalProcesses", lambda *_: more)
+    assert main(["resume", "d", "--total-steps", "2k", "--set", "learning_rate=0.25"]) == 0
+    configs = [open_sweep("d").configuration(member) for member in open_sweep("d").members()]
+    assert {(c["total_steps"], c["rollout"]["learning_rate"]) for c in configs} == {(2000, 0.25)}
+    assert main(["resume", "d", "--set", "lambda=0.25"]) == 1
+    assert "lambda cannot be changed" in capsys.readouterr().err

@@ -14,7 +14,15 @@ from neuralq.apps.cli.kinds import changes_of, conclude, measured_by, new_budget
 from neuralq.apps.cli.numbers import number
 from neuralq.apps.cli.options import parse_train
 from neuralq.apps.cli.progress import training_bar
-from neuralq.apps.cli.sweeps import add_trust, add_which, resume_seeds, single_run, started_from, train_seeds
+from neuralq.apps.cli.sweeps import (
+    a_configuration,
+    add_trust,
+    add_which,
+    resume_seeds,
+    single_run,
+    started_from,
+    train_seeds,
+)
 from neuralq.runs import Run, evaluate_run, load
 from neuralq.runs.changes import told
 from neuralq.runs.control import CONTROL, agent_of, last_cap
@@ -35,7 +43,7 @@ from neuralq.runs.kinds import KINDS, kind_in, kind_named
 from neuralq.runs.offline.files import read_recorded
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.report import write_report, write_sweep_report
-from neuralq.runs.sweep import is_sweep_folder, open_sweep
+from neuralq.runs.sweep import is_sweep_folder
 
 __all__ = ["evaluate", "report", "resume", "train"]
 
@@ -121,7 +129,7 @@ def _asked_of(options: argparse.Namespace) -> tuple[int | None, dict[str, Any]]:
     changes = {name: getattr(options, name) for name in ("stop_at_return", "device") if hasattr(options, name)}
     if not options.changes:
         return total_steps, changes
-    stored = open_sweep(options.run).config if is_sweep_folder(options.run) else read_config(options.run)
+    stored = a_configuration(options.run) if is_sweep_folder(options.run) else read_config(options.run)
     asked = changes_of(CONTROL, config_from_dict(stored), options.changes)
     if twice := {*changes, *([] if total_steps is None else ["total_steps"])} & set(asked):
         raise Failure(f"{min(twice)} is given twice, with --set and by its own option; leave one out", 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,13 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 from neuralq.apps.cli import Failure, command_parser, print_result
-from neuralq.apps.cli.sweeps import run_to_the_end
+from neuralq.apps.cli.numbers import any_number
 from neuralq.apps.cli.yaml_text import read_text
 from neuralq.runs.folder.run_folder import RunFolderError
-from neuralq.runs.hooks import own_hook
-from neuralq.runs.sweep import (
-    Asked,
-    Engine,
-    LocalProcesses,
-    Member,
-    RunState,
-    Sweep,
-    ask,
-    is_sweep_folder,
-    open_sweep,
-    read_asked,
-    share_of,
-)
-from neuralq.runs.sweep.scripts import REQUEUE, kubernetes_job, num_shares, slurm_script
+from neuralq.runs.sweep.asked import Asked, read_asked
+from neuralq.runs.sweep.folder import Member, Sweep, ask, is_sweep_folder, open_sweep
+from neuralq.runs.sweep.scripts import kubernetes_job, num_shares, slurm_script
+from neuralq.runs.sweep.states import RunState
 
 __all__ = ["sweep"]
 
@@ -38,18 +28,19 @@ def sweep(argv: list[str]) -> int:
     """Make the runs that a file asks for, or go on with them; or tell how far they are."""
     options = _parser().parse_args(argv)
     *file, folder = options.what
+    if len(file) > 1:
+        raise Failure(f"a file and a folder, two words at most, got {' '.join(options.what)}", 2)
+    if options.of is not None and options.index is None and not (options.slurm_script or options.kubernetes_job):
+        raise Failure("--of says how many shares there are; add --index, which one to make", 2)
     found = _asked_for(file[0], folder, options) if file else _there(folder)
     if options.status:
         return _status(found, options.json)
     if options.slurm_script or options.kubernetes_job:
         print(_script(found, options), end="")
         return 0
-    members = None if options.index is None else share_of(found, options.index, options.of or len(found))
-    engine = _engine(found, options)
-    if members is None:
-        return run_to_the_end(found, engine, options.json, retry_failed=options.retry_failed)
-    status = run_to_the_end(found, engine, options.json, members=members, retry_failed=options.retry_failed)
-    return REQUEUE if status > 128 else status
+    from neuralq.apps.cli.sweeps import make_runs  # brings PyTorch, which telling how far it is does not need
+
+    return make_runs(found, options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -94,6 +85,8 @@ def _parser() -> argparse.ArgumentParser:
 def _asked_for(file: str, folder: str, options: argparse.Namespace) -> Sweep:
     words = [f"--{name}" for name in ("tensorboard", "wandb") if getattr(options, name)]
     for hook in options.hook:
+        from neuralq.runs.hooks import own_hook
+
         own_hook(hook)  # a name that is wrong is one error, not one for each run
         words += ["--hook", hook]
     asked = _read(file)
@@ -111,9 +104,19 @@ def _read(file: str) -> Asked:
     if not isinstance(content, dict):
         raise Failure(f"{file} must hold a mapping of options, got {type(content).__name__}", 2)
     try:
-        return read_asked(content)
+        return read_asked(_numbers(content))
     except ValueError as error:
         raise Failure(f"{file}: {error}", 2) from error
+
+
+def _numbers(value: Any) -> Any:
+    """With 100k and 2.5M, which YAML has no word for, as numbers."""
+    if isinstance(value, dict):
+        return {name: _numbers(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_numbers(inner) for inner in value]
+    is_written = isinstance(value, str) and re.fullmatch(r"[\d._]*\d[\d._]*[kKMG]", value, re.ASCII)
+    return any_number(value) if is_written else value
 
 
 def _script(found: Sweep, options: argparse.Namespace) -> str:
@@ -135,11 +138,6 @@ def _there(folder: str) -> Sweep:
     if not is_sweep_folder(folder):
         raise RunFolderError(f"there is no sweep in {folder}; start one with: neuralq sweep FILE.yaml {folder}")
     return open_sweep(folder)
-
-
-def _engine(found: Sweep, options: argparse.Namespace) -> Engine:
-    first = next(found.members())
-    return LocalProcesses(options.workers, found.configuration(first))
 
 
 def _status(found: Sweep, as_json: bool) -> int:

@@ -37,13 +37,18 @@ from neuralq.runs.sweep import (
     is_sweep_folder,
     open_sweep,
     run_sweep,
+    share_of,
 )
+from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.runs.trust import refuse_strangers
 
 __all__ = [
+    "a_configuration",
     "add_trust",
     "add_which",
+    "engine_of",
+    "make_runs",
     "refuse_other_kinds",
     "resume_seeds",
     "run_to_the_end",
@@ -111,6 +116,12 @@ def resume_seeds(
     return run_to_the_end(sweep, LocalProcesses(num_workers, sweep.configuration(members[0])), as_json)
 
 
+def a_configuration(path: str | Path) -> dict[str, Any]:
+    """The configuration of the first run of a sweep."""
+    sweep = open_sweep(path)
+    return sweep.configuration(next(sweep.members()))
+
+
 def add_which(parser: argparse.ArgumentParser) -> None:
     """Which of a run's two agents is meant: ``best`` is None where it is left to the run."""
     which = parser.add_mutually_exclusive_group()
@@ -155,6 +166,19 @@ def refuse_other_kinds(path: str | Path) -> None:
     name = kind_in(path)
     if name is not None and (command := kind_named(name).command) is not None:
         raise Failure(f"{path} is {kind_named(name).title}, which is {command.instead.format(run=path)}", 2)
+
+
+def make_runs(sweep: Sweep, options: argparse.Namespace) -> int:
+    """What ``neuralq sweep`` was asked for beside telling how far a sweep is: its runs, or a share of them."""
+    members = None if options.index is None else share_of(sweep, options.index, options.of or len(sweep))
+    again = options.retry_failed
+    status = run_to_the_end(sweep, engine_of(sweep, options), options.json, members=members, retry_failed=again)
+    return REQUEUE if members is not None and status > 128 else status
+
+
+def engine_of(sweep: Sweep, options: argparse.Namespace) -> Engine:
+    """What makes the runs, as the options of ``neuralq sweep`` say."""
+    return LocalProcesses(options.workers, sweep.configuration(next(sweep.members())))
 
 
 def run_to_the_end(
@@ -229,7 +253,7 @@ def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
             text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
         lines.append(text)
     if sweep.axes:
-        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes))}")
+        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes)).rstrip('_')}")
     return [*lines, f"sweep folder {sweep.path}"]
 
 

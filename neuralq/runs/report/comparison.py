@@ -32,7 +32,10 @@ _CURVE_RESAMPLES = 1_000
 
 @dataclass(frozen=True)
 class SeedRun:
-    """One run: its folder, seed, greedy evaluations ``[E]``, what its agent scores, and costs."""
+    """One run: its folder, seed, greedy evaluations ``[E]``, what its agent scores, and costs.
+
+    Its task is what it shares with the runs that differ from it in nothing but their seed, where others are compared.
+    """
 
     path: Path
     seed: int
@@ -41,17 +44,18 @@ class SeedRun:
     score: Score
     env_steps: int
     cpu_seconds: float
+    task: str = ""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in their seed alone.
+    """Runs that differ in their seed alone, or that have the value of one option in common.
 
     Args:
         name: of the sweep's folder, or of the first run's.
         label: what sets the group apart, in words; its name where that is not short and clear.
         settings: of its configuration, those in which the groups differ.
-        runs: one per seed, each with at least one greedy evaluation.
+        runs: each with at least one greedy evaluation; one per seed, of each task.
     """
 
     name: str
@@ -66,8 +70,12 @@ class Group:
 
     @property
     def estimate(self) -> Estimate:
-        """Their interquartile mean with its interval."""
-        return estimate(self.returns)
+        """Their interquartile mean with its interval; of several tasks stratified, where all have as many runs."""
+        tasks: dict[str, list[float]] = {}
+        for run in self.runs:
+            tasks.setdefault(run.task, []).append(run.score.mean)
+        even = len({len(scores) for scores in tasks.values()}) == 1
+        return estimate(np.transpose(list(tasks.values())) if even and len(tasks) > 1 else self.returns)
 
     def plain(self) -> dict[str, Any]:
         """The same as plain values."""
@@ -129,7 +137,8 @@ def read_groups(paths: Sequence[str | Path]) -> tuple[list[Group], list[str]]:
             # A seed that comes again under one configuration is no further evidence: it stands in a group of its own.
             again = next(n for n in range(len(seen)) if run.seed not in {r.seed for r in gathered.get((words, n), [])})
             gathered.setdefault((words, again), []).append(run)
-            found.setdefault((words, again), (path.name, settings))
+            cell = folder.parent.name if folder.parent not in (path, path.parent) else path.name
+            found.setdefault((words, again), (cell, settings))
     if not gathered:
         raise RunFolderError("nothing to compare: " + "; ".join(left_out))
     return _named([(*found[key], tuple(runs)) for key, runs in gathered.items()]), left_out
@@ -251,7 +260,8 @@ def _paint(figure: Figure, groups: Sequence[Group]) -> None:
     for number, group in enumerate(groups):
         curve = group_curve(group)
         colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        seeds = f" ({len(group.runs)} seeds)" if len(group.runs) > 1 else f" (seed {group.runs[0].seed})"
+        counted = "seeds" if len({run.seed for run in group.runs}) == len(group.runs) else "runs"
+        seeds = f" ({len(group.runs)} {counted})" if len(group.runs) > 1 else f" (seed {group.runs[0].seed})"
         if curve.low is not None and curve.high is not None:
             band(axes, curve.steps, curve.low, curve.high, colour)
         every = max(1, len(curve.steps) // 12)

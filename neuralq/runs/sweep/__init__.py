@@ -8,17 +8,35 @@
 Nothing is remembered but what the run folders say (`neuralq.runs.sweep.states`). So a sweep that was killed goes on
 where each run's newest checkpoint stands. What makes the runs is an `Engine`: processes of this machine
 (`LocalProcesses`), or a cluster's.
+
+Each name is loaded when it is first used, so that telling how far a sweep is needs no PyTorch.
 """
 
 from __future__ import annotations
 
-from neuralq.runs.sweep.asked import Asked, read_asked
-from neuralq.runs.sweep.engine import Ended, Engine, run_sweep, share_of
-from neuralq.runs.sweep.folder import Member, Sweep, ask, create_sweep, is_sweep_folder, open_sweep
-from neuralq.runs.sweep.local import LocalProcesses, num_cores
-from neuralq.runs.sweep.results import RunResult, Status, SweepResult
-from neuralq.runs.sweep.states import RunState, state_of
-from neuralq.runs.sweep.work import Task, perform
+TYPE_CHECKING = False  # known to type checkers
+if TYPE_CHECKING:
+    from neuralq.runs.sweep.asked import Asked as Asked
+    from neuralq.runs.sweep.asked import read_asked as read_asked
+    from neuralq.runs.sweep.engine import Ended as Ended
+    from neuralq.runs.sweep.engine import Engine as Engine
+    from neuralq.runs.sweep.engine import run_sweep as run_sweep
+    from neuralq.runs.sweep.engine import share_of as share_of
+    from neuralq.runs.sweep.folder import Member as Member
+    from neuralq.runs.sweep.folder import Sweep as Sweep
+    from neuralq.runs.sweep.folder import ask as ask
+    from neuralq.runs.sweep.folder import create_sweep as create_sweep
+    from neuralq.runs.sweep.folder import is_sweep_folder as is_sweep_folder
+    from neuralq.runs.sweep.folder import open_sweep as open_sweep
+    from neuralq.runs.sweep.local import LocalProcesses as LocalProcesses
+    from neuralq.runs.sweep.local import num_cores as num_cores
+    from neuralq.runs.sweep.results import RunResult as RunResult
+    from neuralq.runs.sweep.results import Status as Status
+    from neuralq.runs.sweep.results import SweepResult as SweepResult
+    from neuralq.runs.sweep.states import RunState as RunState
+    from neuralq.runs.sweep.states import state_of as state_of
+    from neuralq.runs.sweep.task import Task as Task
+    from neuralq.runs.sweep.work import perform as perform
 
 __all__ = [
     "Asked",
@@ -43,3 +61,32 @@ __all__ = [
     "share_of",
     "state_of",
 ]
+
+_HOMES = {
+    **dict.fromkeys(("Asked", "read_asked"), "neuralq.runs.sweep.asked"),
+    **dict.fromkeys(("Ended", "Engine", "run_sweep", "share_of"), "neuralq.runs.sweep.engine"),
+    **dict.fromkeys(
+        ("Member", "Sweep", "ask", "create_sweep", "is_sweep_folder", "open_sweep"), "neuralq.runs.sweep.folder"
+    ),
+    **dict.fromkeys(("LocalProcesses", "num_cores"), "neuralq.runs.sweep.local"),
+    **dict.fromkeys(("RunResult", "Status", "SweepResult"), "neuralq.runs.sweep.results"),
+    **dict.fromkeys(("RunState", "state_of"), "neuralq.runs.sweep.states"),
+    "Task": "neuralq.runs.sweep.task",
+    "perform": "neuralq.runs.sweep.work",
+}
+
+if not TYPE_CHECKING:  # a type checker would believe that every name exists
+
+    def __getattr__(name: str) -> object:
+        """Loads a name at its first use.
+
+        Raises:
+            AttributeError: there is no such name.
+        """
+        from importlib import import_module
+
+        if name not in _HOMES:
+            raise AttributeError(f"module 'neuralq.runs.sweep' has no attribute {name!r}; it has {', '.join(__all__)}")
+        value: object = getattr(import_module(_HOMES[name]), name)
+        globals()[name] = value
+        return value

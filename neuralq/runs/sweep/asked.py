@@ -23,11 +23,8 @@ from typing import Any
 import numpy as np
 
 from neuralq.checks import check_whole
-from neuralq.runs.recipe.config import RunConfig, config_from_dict, config_to_dict
-from neuralq.runs.recipe.keywords import nested, with_body
-from neuralq.runs.recipe.presets import with_preset
 
-__all__ = ["Asked", "cell_name", "check_seeds", "read_asked", "resolved"]
+__all__ = ["Asked", "cell_name", "check_seeds", "read_asked"]
 
 _MOST_RUNS = 10_000_000
 _RANGE = {"from", "to", "step", "count", "scale"}
@@ -154,6 +151,8 @@ def read_asked(content: Mapping[str, Any]) -> Asked:
 
 def _keywords(content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Names as Python has them; settings of the learner, which may stand in a part of their own, flat."""
+    from neuralq.runs.recipe.config import RunConfig  # brings PyTorch, which telling how far a sweep is does not need
+
     learner = str(content.get("learner", RunConfig.learner))
     for name, value in content.items():
         text = re.sub(r"(^|\.)lambda$", r"\1lambda_", str(name).replace("-", "_"))
@@ -206,35 +205,6 @@ def _range_of(name: str, given: Mapping[str, Any]) -> list[Any]:
     return [
         low + i * step if isinstance(low + i * step, int) else float(f"{low + i * step:.6g}") for i in range(number)
     ]
-
-
-def resolved(base: Mapping[str, Any], options: Mapping[str, Any], seed: int) -> dict[str, Any]:
-    """The whole configuration of a run, as `neuralq.runs.recipe.config.config_to_dict` writes it.
-
-    Args:
-        base: what all runs share; its ``preset`` is as for `neuralq.train`.
-        options: of this run.
-        seed: of this run.
-
-    Raises:
-        ValueError: for unknown names and values out of range.
-
-    Example:
-        >>> found = resolved({"env": "CartPole-v1"}, {"lambda_": 0.5}, 3)
-        >>> found["rollout"]["lambda_"], found["seed"]
-        (0.5, 3)
-    """
-    given = {**base, **options, "seed": seed}
-    preset = given.pop("preset", True)
-    if not given.get("env"):
-        raise ValueError("a sweep needs an environment, e.g. env: CartPole-v1")
-    plain = {"env": given.pop("env")}
-    if preset is False:
-        config = config_from_dict(with_body(nested(plain, given)))
-    else:
-        config = with_preset(plain, preset=preset if isinstance(preset, str) else None, **given)
-    whole: dict[str, Any] = _plain(config_to_dict(config))
-    return whole
 
 
 def cell_name(options: Mapping[str, Any]) -> str:

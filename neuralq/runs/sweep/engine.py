@@ -21,7 +21,7 @@ from neuralq.runs.stop_request import StopRequest
 from neuralq.runs.sweep.folder import Member, Sweep
 from neuralq.runs.sweep.results import RunResult, Status, SweepResult
 from neuralq.runs.sweep.states import RunState, note_failure, saved_steps, steps_so_far
-from neuralq.runs.sweep.work import Task
+from neuralq.runs.sweep.task import Task
 
 __all__ = ["Ended", "Engine", "run_sweep", "share_of"]
 

@@ -12,9 +12,9 @@ from typing import Any
 from neuralq.checks import check_whole
 from neuralq.runs.folder.files import read_json, to_json, write_durably
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder
-from neuralq.runs.sweep.asked import Asked, cell_name, check_seeds, resolved
+from neuralq.runs.sweep.asked import Asked, cell_name, check_seeds
 from neuralq.runs.sweep.states import RunState, state_of
-from neuralq.runs.sweep.work import Task
+from neuralq.runs.sweep.task import Task
 
 __all__ = ["Member", "Sweep", "ask", "create_sweep", "is_sweep_folder", "open_sweep"]
 
@@ -87,6 +87,8 @@ class Sweep:
         """
         if self.axes is None:
             return {**self.config, "seed": member.seed}
+        from neuralq.runs.sweep.resolving import resolved  # brings PyTorch, as in `_check_cells`
+
         place = member.name.rpartition("/")[0]
         if place not in self._cells:
             self._cells[place] = resolved(self.config, member.options, member.seed)
@@ -172,6 +174,8 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
 
 def _check_cells(sweep: Sweep) -> None:
     """Raises ValueError where a combination of values is no configuration: before anything is begun."""
+    from neuralq.runs.sweep.resolving import resolved
+
     for cell in sweep.asked.cells():
         try:
             resolved(sweep.config, cell, sweep.seeds[0])

@@ -24,7 +24,8 @@ from neuralq.checks import check_whole
 from neuralq.runs.children import safe_path, with_environment, without_main
 from neuralq.runs.folder.files import open_regular, refuse_links
 from neuralq.runs.sweep.engine import Ended
-from neuralq.runs.sweep.work import Task, perform
+from neuralq.runs.sweep.task import Task
+from neuralq.runs.sweep.work import perform
 
 __all__ = ["LocalProcesses", "free_memory", "num_cores", "run_forked"]
 

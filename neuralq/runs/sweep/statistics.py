@@ -116,10 +116,10 @@ def bootstrap_interval(
 
 
 def estimate(scores: ArrayLike, seed: int = 0) -> Estimate:
-    """Interquartile mean and 95 % interval of one task's runs; the same scores give the same interval every time.
+    """Interquartile mean and 95 % interval; the same scores give the same interval every time.
 
     Args:
-        scores: ``[num_runs]``.
+        scores: ``[num_runs]`` of one task, or ``[num_runs, num_tasks]``.
         seed: of the resamples.
 
     Raises:
@@ -129,12 +129,12 @@ def estimate(scores: ArrayLike, seed: int = 0) -> Estimate:
         >>> estimate([500.0, 500.0, 480.0]).iqm, estimate([500.0]).low
         (493.3333333333333, None)
     """
-    values = np.asarray(scores, np.float64).reshape(-1)
-    iqm = float(interquartile_mean(values))
+    values = np.asarray(scores, np.float64)
+    iqm = float(interquartile_mean(values.reshape(-1)))
     if len(values) < 2:
-        return Estimate(iqm, None, None, len(values))
+        return Estimate(iqm, None, None, values.size)
     low, high = bootstrap_interval(values, np.random.default_rng(seed))
-    return Estimate(iqm, float(low), float(high), len(values))
+    return Estimate(iqm, float(low), float(high), values.size)
 
 
 def median_interval(scores: ArrayLike, confidence: float = 0.95) -> tuple[float, float] | None:

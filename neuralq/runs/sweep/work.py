@@ -7,8 +7,6 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from neuralq.runs.control import CONTROL
@@ -20,30 +18,9 @@ from neuralq.runs.hooks import watching_hooks
 from neuralq.runs.loop import Hook
 from neuralq.runs.recipe.config import config_from_dict
 from neuralq.runs.sweep.states import forget_failure, note_failure
+from neuralq.runs.sweep.task import Task
 
-__all__ = ["Task", "perform"]
-
-
-@dataclass(frozen=True)
-class Task:
-    """A run that is to be made; it can be sent to another process or machine.
-
-    Args:
-        name: of the run within its sweep.
-        path: its run folder.
-        config: its whole configuration, as `neuralq.runs.recipe.config.config_to_dict` writes it.
-        options: what else was asked for, as words of the command line.
-    """
-
-    name: str
-    path: Path
-    config: dict[str, Any]
-    options: tuple[str, ...] = ()
-
-    @property
-    def log_path(self) -> Path:
-        """What its process prints."""
-        return self.path.with_name(f"{self.path.name}.log")
+__all__ = ["perform"]
 
 
 def perform(task: Task) -> None:
