@@ -40,7 +40,7 @@ class Mortal:
             checkpoint, "save_file", self.wrap(checkpoint.save_file, lambda t, p: Path(p).write_bytes(b"12"))
         )
         monkeypatch.setattr(np, "save", self.wrap(np.save, lambda file, a, allow_pickle: file.write(b"\x93NUMPY")))
-        monkeypatch.setattr(checkpoint, "_signed", self.wrap(checkpoint._signed))
+        monkeypatch.setattr(checkpoint, "signed", self.wrap(checkpoint.signed))
 
     def wrap(self, function: Callable[..., Any], partial: Callable[..., Any] | None = None) -> Callable[..., Any]:
         def mortal(*args: Any, **kwargs: Any) -> Any:

@@ -300,12 +300,19 @@ def test_each_run_gets_its_options_over_the_preset_of_its_environment(tmp_path: 
         ({"from": 1e-4, "to": 1e-2, "count": 3, "scale": "log"}, [1e-4, 1e-3, 1e-2]),
         ({"from": 0.1, "to": 0.3, "step": 0.1}, [0.1, 0.2, 0.3]),
         ([[64, 64], [32]], [[64, 64], [32]]),
+        ([True, False], [True, False]),
     ],
 )
 def test_lists_and_ranges_are_axes(value: Any, values: list[Any]) -> None:
     asked = read_asked({"env": "X-v0", "rollout": {"some": value}, "gamma": 0.9, "seeds": {"from": 3, "to": 5}})
     assert asked.axes == {"some": values} and asked.base == {"env": "X-v0", "gamma": 0.9}
     assert asked.seeds == (3, 4, 5) and asked.num_cells == len(values)
+
+
+def test_a_list_is_one_value_of_an_option_whose_values_are_lists() -> None:
+    asked = read_asked({"env": "X-v0", "hidden": [64, 64], "wrappers": [["a:B"], []], "rules": [{"action": 1}]})
+    assert asked.base == {"env": "X-v0", "hidden": [64, 64], "rules": [{"action": 1}]}
+    assert asked.axes == {"wrappers": [["a:B"], []]}
 
 
 @pytest.mark.parametrize(
@@ -491,7 +498,7 @@ def test_a_killed_sweep_ends_with_the_bits_of_runs_that_were_never_stopped(
         assert rows == [row["greedy_return"] for row in read_metrics(single) if row["kind"] == "evaluation"]
 
 
-FILE = "env: CartPole-v1\ntotal_steps: 1k\nlambda: [0.5, 0.9]\nhidden: [[8]]\nseeds: 2\n"
+FILE = "env: CartPole-v1\ntotal_steps: 1k\nlambda: [0.5, 0.9]\nhidden: ['8']\nseeds: 2\n"
 
 
 @pytest.fixture
@@ -560,6 +567,7 @@ def test_a_share_that_is_asked_to_end_says_that_it_is_to_be_begun_again(
         ("env: CartPole-v1\nlamda: [0.9]", ["s.yaml", "d"], "did you mean"),
         ("env: CartPole-v1\ngamma: [0.9, 2]", ["s.yaml", "d"], r"(with gamma 2)"),
         ("env: CartPole-v1\nreplay.learning_rate: 1", ["s.yaml", "d"], "replay.learning_rate"),
+        ("env: td-gammon", ["s.yaml", "d"], "one by one: neuralq train td-gammon --seed 0"),
         ("- a", ["s.yaml", "d"], "must hold a mapping of options, got list"),
         ("env: [", ["s.yaml", "d"], "cannot read s.yaml"),
         (FILE, ["s.yaml"], "neuralq sweep s.yaml DIR"),

@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("what", nargs="+", metavar="FILE.yaml DIR", help="what is asked for, and where the runs go")
     parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
+    _add_cluster(parser)
     parser.add_argument("--status", action="store_true", help="tell how far each run is, and make none")
     parser.add_argument("--retry-failed", action="store_true", help="begin runs again that have failed")
     parser.add_argument("--index", type=int, metavar="I", help="make one share of the runs, counted from 0")
@@ -80,6 +81,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--tensorboard", action="store_true", help="write TensorBoard event files (extra tensorboard)")
     parser.add_argument("--wandb", action="store_true", help="log to Weights & Biases (extra wandb)")
     return parser
+
+
+def _add_cluster(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--ray", metavar="ADDRESS",
+        help="make the runs on a Ray cluster that this machine belongs to: HOST:PORT of its head, or auto (extra ray)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--storage", choices=("shared", "none"), default="shared",
+        help="whether all nodes of the cluster see DIR by its name, or the runs are sent home (default: shared)",
+    )  # fmt: skip
+    parser.add_argument("--cpus", type=float, default=1.0, metavar="X", help="CPUs that Ray gives a run (default: 1)")
+    parser.add_argument("--gpus", type=float, default=0.0, metavar="X", help="GPUs that Ray gives a run (default: 0)")
 
 
 def _asked_for(file: str, folder: str, options: argparse.Namespace) -> Sweep:
@@ -112,11 +126,19 @@ def _read(file: str) -> Asked:
 def _numbers(value: Any) -> Any:
     """With 100k and 2.5M, which YAML has no word for, as numbers."""
     if isinstance(value, dict):
-        return {name: _numbers(inner) for name, inner in value.items()}
+        return {name: _widths(inner) if name == "hidden" else _numbers(inner) for name, inner in value.items()}
     if isinstance(value, list):
         return [_numbers(inner) for inner in value]
     is_written = isinstance(value, str) and re.fullmatch(r"[\d._]*\d[\d._]*[kKMG]", value, re.ASCII)
     return any_number(value) if is_written else value
+
+
+def _widths(value: Any) -> Any:
+    """Of hidden layers, which may be written as on the command line, 64,64; a list of such is several networks."""
+    if isinstance(value, list) and any(isinstance(one, str) for one in value):
+        return [_widths(one) for one in value]
+    is_written = isinstance(value, str) and re.fullmatch(r"[\d,\s]*\d[\d,\s]*", value, re.ASCII)
+    return [int(width) for width in re.findall(r"\d+", value)] if is_written else value
 
 
 def _script(found: Sweep, options: argparse.Namespace) -> str:

@@ -39,6 +39,7 @@ from neuralq.runs.sweep import (
     run_sweep,
     share_of,
 )
+from neuralq.runs.sweep.ray_cluster import RayCluster
 from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.statistics import interquartile_mean
 from neuralq.runs.trust import refuse_strangers
@@ -178,6 +179,10 @@ def make_runs(sweep: Sweep, options: argparse.Namespace) -> int:
 
 def engine_of(sweep: Sweep, options: argparse.Namespace) -> Engine:
     """What makes the runs, as the options of ``neuralq sweep`` say."""
+    if options.ray is not None:
+        if options.workers is not None:
+            raise Failure("--workers is for processes of this machine; on a cluster --cpus says what a run takes", 2)
+        return RayCluster(options.ray, sweep.path, options.cpus, options.gpus, options.storage)
     return LocalProcesses(options.workers, sweep.configuration(next(sweep.members())))
 
 

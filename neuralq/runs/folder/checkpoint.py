@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import importlib.metadata
 import json
 import math
@@ -32,22 +31,25 @@ from safetensors.torch import load as load_bytes
 from safetensors.torch import load_file, save_file
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import RunFolderError, open_regular, parse_json, read_regular
+from neuralq.runs.folder.whole import (
+    FORMAT_NAME,
+    FORMAT_VERSION,
+    MANIFEST,
+    STATE,
+    CheckpointError,
+    candidates,
+    fingerprint,
+    read_manifest,
+    signed,
+    verified,
+)
 
 __all__ = ["FORMAT_VERSION", "Checkpoint", "CheckpointError", "load", "load_newest", "save", "storable"]
 
-FORMAT_NAME = "neuralq-checkpoint"
-FORMAT_VERSION = 1
 # From this size an array gets a file of its own: below it, one more fsync costs more than the bytes.
 OWN_FILE_BYTES = 1 << 20
-_MANIFEST, _STATE, _TENSORS, _ARRAYS = "manifest.json", "state.json", "tensors.safetensors", "arrays.npy"
-_FILE_NAME = re.compile(r"state\.json|tensors\.safetensors|arrays\.npy|array-[0-9]{5}\.npy")
-_FOLDER_NAME = re.compile(r"step-([0-9]{12,18})(\.replaced)?")
+_TENSORS, _ARRAYS = "tensors.safetensors", "arrays.npy"
 _TEMPORARY_NAME = re.compile(r"\.tmp-(write|drop)-step-[0-9]{12,18}(\.replaced)?-[0-9a-f]+")
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or must not be read; the message says which one, why, and the way out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +134,9 @@ def load(path: str | Path) -> Checkpoint:
         {'epsilon': 0.1, 'names': ['left', 'right']}
     """
     path = Path(path)
-    step, files = _verified(path)
+    step, files = verified(path)
     try:
-        document = json.loads((path / _STATE).read_bytes())
+        document = json.loads((path / STATE).read_bytes())
         tensors = _read_tensors(path / _TENSORS) if _TENSORS in files else {}
         arrays = _read_arrays(path / _ARRAYS) if _ARRAYS in files else []
         own = {n: np.load(path / n, allow_pickle=False) for n in files if n.startswith("array-")}
@@ -162,7 +164,7 @@ def load_newest(folder: str | Path) -> Checkpoint:
     """
     folder = Path(folder)
     refused: list[str] = []
-    for path in _candidates(folder) if folder.is_dir() else []:
+    for path in candidates(folder) if folder.is_dir() else []:
         try:
             checkpoint = load(path)
         except CheckpointError as error:
@@ -295,10 +297,10 @@ def _fill(temporary: Path, step: int, document: Any, packing: _Packing) -> None:
     for name, array in packing.own.items():
         with _durable(temporary / name) as file:
             np.save(file, array, allow_pickle=False)
-    with _durable(temporary / _STATE) as file:
+    with _durable(temporary / STATE) as file:
         file.write(json.dumps(document, allow_nan=False).encode())
-    with _durable(temporary / _MANIFEST) as file:
-        files = {p.name: _fingerprint(p) for p in sorted(temporary.iterdir()) if p.name != _MANIFEST}
+    with _durable(temporary / MANIFEST) as file:
+        files = {p.name: fingerprint(p) for p in sorted(temporary.iterdir()) if p.name != MANIFEST}
         body = {
             "format": FORMAT_NAME,
             "version": FORMAT_VERSION,
@@ -306,7 +308,7 @@ def _fill(temporary: Path, step: int, document: Any, packing: _Packing) -> None:
             "libraries": _versions(),
             "files": files,
         }
-        file.write(_signed(body))
+        file.write(signed(body))
     _sync(temporary)
 
 
@@ -326,59 +328,10 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _fingerprint(path: Path) -> dict[str, Any]:
-    with open(open_regular(path, os.O_RDONLY), "rb") as file:
-        return {"bytes": os.fstat(file.fileno()).st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-
-
 @functools.cache
 def _versions() -> dict[str, str]:
     versions = {name: importlib.metadata.version(name) for name in ("numpy", "safetensors")}
     return {"neuralq": importlib.metadata.version("neuralq"), "torch": str(torch.__version__), **versions}
-
-
-def _signed(body: Mapping[str, Any]) -> bytes:
-    """The manifest vouches for the other files; its own digest, over its other members, vouches for it."""
-    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
-    return json.dumps({**body, "sha256": digest}, indent=1).encode()
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        raw = read_regular(path / _MANIFEST)
-        manifest = parse_json(raw)
-    except (OSError, ValueError, RunFolderError) as error:
-        raise CheckpointError(f"{path} is no whole checkpoint: its {_MANIFEST} cannot be read ({error})") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT_NAME:
-        raise CheckpointError(f"{path} was not written by neuralq: its {_MANIFEST} is of another format")
-    version = manifest.get("version")
-    if isinstance(version, int) and version > FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path} has format version {version}, and this neuralq reads up to {FORMAT_VERSION}; upgrade neuralq"
-        )
-    if raw != _signed({k: v for k, v in manifest.items() if k != "sha256"}):
-        raise CheckpointError(f"{path} is damaged: its {_MANIFEST} does not match its own SHA-256")
-    return manifest
-
-
-def _verified(path: Path) -> tuple[int, dict[str, Any]]:
-    """Step and files of a checkpoint whose every byte is the one that was written."""
-    manifest = _read_manifest(path)
-    step, files = manifest.get("step"), manifest.get("files")
-    if type(step) is not int or not isinstance(files, dict) or _STATE not in files:
-        raise CheckpointError(f"{path} has a malformed {_MANIFEST}")
-    if (named := _FOLDER_NAME.fullmatch(path.name)) and int(named[1]) != step:
-        raise CheckpointError(f"{path} holds step {step}: the folder was renamed")
-    for name, expected in files.items():
-        if not _FILE_NAME.fullmatch(name):  # also keeps a forged manifest from pointing outside the folder
-            raise CheckpointError(f"{path} lists the file {name!r}, which is not a checkpoint's")
-        try:
-            got = _fingerprint(path / name)
-        except (OSError, RunFolderError) as error:
-            raise CheckpointError(f"{path} is incomplete: {name} cannot be read ({error})") from error
-        if got != expected:
-            raise CheckpointError(f"{path} is damaged: {name} is not what was written (size or SHA-256 differs)")
-    return step, files
 
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -399,24 +352,18 @@ def _read_arrays(path: Path) -> list[np.ndarray[Any, Any]]:
     return arrays
 
 
-def _candidates(folder: Path) -> list[Path]:
-    """Newest first; of two with one step, the one that replaced the other first."""
-    found = [(int(m[1]), m[2] is None, p) for p in folder.iterdir() if (m := _FOLDER_NAME.fullmatch(p.name))]
-    return [p for _, _, p in sorted(found, key=lambda f: f[:2], reverse=True)]
-
-
 def _prune(folder: Path, newest: Path, keep: int) -> None:
     """Deletes our checkpoints that are older than the last ``keep`` whole ones, and nothing that is not ours."""
     num_whole = 1
-    for path in _candidates(folder):
+    for path in candidates(folder):
         if path == newest:
             continue
         try:
             if num_whole >= keep:
-                _read_manifest(path)
+                read_manifest(path)
                 _drop(path)
             else:
-                _verified(path)
+                verified(path)
                 num_whole += 1
         except CheckpointError:
             continue

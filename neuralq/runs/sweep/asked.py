@@ -7,7 +7,8 @@
     lambda: {from: 0.5, to: 0.9, count: 3}                           three values, equally far from each other
     seeds: 8                                                         0 to 7; or a list, or a range
 
-Names are those of `neuralq.train`'s keywords. An option whose value is a list itself stands in another list.
+Names are those of `neuralq.train`'s keywords. Of options whose value is a list itself (hidden, wrappers, rules) a list
+is one value, and a list of lists several: ``hidden: [64, 64]`` is one network, ``hidden: [[64, 64], [32]]`` are two.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ __all__ = ["Asked", "cell_name", "check_seeds", "read_asked"]
 
 _MOST_RUNS = 10_000_000
 _RANGE = {"from", "to", "step", "count", "scale"}
+_LISTS = {"hidden", "wrappers", "rules"}
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def read_asked(content: Mapping[str, Any]) -> Asked:
             continue
         if isinstance(value, Mapping) and value.keys() <= _RANGE and {"from", "to"} <= value.keys():
             axes[name] = _range_of(name, value)
-        elif isinstance(value, list):
+        elif isinstance(value, list) and (name not in _LISTS or all(isinstance(one, list) for one in value)):
             axes[name] = value
         else:
             base[name] = value

@@ -150,14 +150,33 @@ class _Loop:
     def __init__(self, sweep: Sweep, engine: Engine, members: list[Member], retry_failed: bool) -> None:
         self.sweep, self.engine, self.members = sweep, engine, members
         self.by_name = {member.name: member for member in members}
-        self.states = {member.name: sweep.state(member) for member in members}
-        passed = ("finished",) if retry_failed else ("finished", "failed")
-        self.waiting = deque(m for m in members if self.states[m.name].state not in passed)
+        self.states: dict[str, RunState] = {}
         self.elsewhere: list[Member] = []
         self.attempts: dict[str, tuple[int, int]] = {}
         self.stopping = False
         self._looked = time.monotonic()
-        self._steps = {name: int(sweep.configuration(self.by_name[name])["total_steps"]) for name in self.by_name}
+        self._budgets = {member.name: int(sweep.configuration(member)["total_steps"]) for member in members}
+        self._steps: dict[str, int] = {}
+        self._returns: dict[str, float] = {}
+        self._failed: dict[str, None] = {}
+        for member in members:
+            self._note(member, sweep.state(member))
+        passed = ("finished",) if retry_failed else ("finished", "failed")
+        self.waiting = deque(m for m in members if self.states[m.name].state not in passed)
+
+    def _note(self, member: Member, state: RunState) -> None:
+        """What is known of a run from now on; sums over thousands of runs are not made anew for each look at them."""
+        name = member.name
+        self.states[name] = state
+        self._failed.pop(name, None)
+        if state.state == "finished":
+            self._steps[name] = self._budgets[name]
+            if (score := score_of(state.summary)) is not None:
+                self._returns[name] = score.mean
+        elif state.state == "failed":
+            self._failed[name] = None
+        elif state.state == "stopped":
+            self._steps[name] = min(self._budgets[name], steps_so_far(self.sweep.path / name))
 
     def stop(self) -> None:
         """Nothing new is begun, and what goes on is asked to end."""
@@ -176,14 +195,14 @@ class _Loop:
             member = self.waiting.popleft()
             state = self.sweep.state(member)
             if state.state == "finished":  # meanwhile, by another process
-                self.states[member.name] = state
+                self._note(member, state)
             elif state.state == "running":
                 self.elsewhere.append(member)
             else:
                 self._start(member)
 
     def _start(self, member: Member) -> None:
-        self.states[member.name] = RunState("running")
+        self._note(member, RunState("running"))
         try:
             self.engine.start(self.sweep.task(member))
         except (OSError, RunFolderError, ValueError) as error:  # no room for a process or a log: this run's alone
@@ -194,7 +213,7 @@ class _Loop:
             member = self.by_name[ended.task.name]
             state = self.sweep.state(member)
             if state.state in ("finished", "failed") or self.stopping:
-                self.states[member.name] = state
+                self._note(member, state)
                 continue
             saved, before = saved_steps(ended.task.path), self.attempts.get(member.name, (-1, 0))
             self.attempts[member.name] = (saved, before[1] + 1 if saved == before[0] else 1)
@@ -203,12 +222,12 @@ class _Loop:
             elif self.attempts[member.name][1] >= _MOST_ATTEMPTS:
                 self._fail(member, f"{ended.reason or 'it ended before its end'}, {_MOST_ATTEMPTS} times over")
             else:
-                self.states[member.name] = state
+                self._note(member, state)
                 self.waiting.append(member)
 
     def _fail(self, member: Member, reason: str) -> None:
         note_failure(self.sweep.path / member.name, reason)
-        self.states[member.name] = RunState("failed", reason)
+        self._note(member, RunState("failed", reason))
 
     def result(self, member: Member) -> RunResult:
         state = self.states[member.name]
@@ -221,20 +240,13 @@ class _Loop:
 
     def status(self) -> Status:
         running = {task.name: task.path for task in self.engine.running()}
-        ended = {name: state for name, state in self.states.items() if name not in running}
-        finished = [name for name, state in ended.items() if state.state == "finished"]
-        steps = sum(self._steps[name] for name in finished)
-        steps += sum(min(self._steps[name], steps_so_far(path)) for name, path in running.items())
-        steps += sum(
-            min(self._steps[name], steps_so_far(self.sweep.path / name))
-            for name, state in ended.items() if state.state == "stopped"
-        )  # fmt: skip
-        scores = {name: score_of(ended[name].summary) for name in finished}
+        for name, path in running.items():
+            self._steps[name] = min(self._budgets[name], steps_so_far(path))
         return Status(
-            env_steps=steps,
-            total_steps=sum(self._steps.values()),
+            env_steps=sum(self._steps.values()),
+            total_steps=sum(self._budgets.values()),
             running=tuple(running),
-            num_finished=len(finished),
-            failed=tuple(name for name, state in ended.items() if state.state == "failed"),
-            returns={name: score.mean for name, score in scores.items() if score is not None},
+            num_finished=sum(state.state == "finished" for state in self.states.values()),
+            failed=tuple(self._failed),
+            returns=self._returns,
         )

@@ -8,12 +8,7 @@ however that ends: it saves and stops.
 from __future__ import annotations
 
 import contextlib
-import json
-import multiprocessing
 import os
-import signal
-import sys
-import threading
 from collections.abc import Mapping
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -21,19 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.children import safe_path, with_environment, without_main
 from neuralq.runs.folder.files import open_regular, refuse_links
 from neuralq.runs.sweep.engine import Ended
+from neuralq.runs.sweep.forked import reason_of, run_forked
 from neuralq.runs.sweep.task import Task
-from neuralq.runs.sweep.work import perform
 
-__all__ = ["LocalProcesses", "free_memory", "num_cores", "run_forked"]
+__all__ = ["LocalProcesses", "free_memory", "num_cores"]
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_GRACE_SECONDS = 120
-"""That a run has to save once the process that asked for it is gone."""
 _SPARE_BYTES = 1 << 28
-_TAIL_BYTES = 1 << 16
 
 
 def num_cores() -> int:
@@ -115,61 +105,6 @@ class LocalProcesses:
             process.kill()
             process.join()
         self._running.clear()
-
-
-def run_forked(task: Task, num_threads: int = 1, config: Mapping[str, Any] | None = None) -> BaseProcess:
-    """A process that performs a task, started.
-
-    Args:
-        task: what it does.
-        num_threads: that libraries of its have.
-        config: of a run like those that will be made; its kernels are made ready in the process that all are forked of.
-    """
-    context: Any = multiprocessing.get_context("spawn" if sys.platform == "darwin" else "forkserver")
-    if sys.platform != "darwin":  # where a process that has loaded frameworks of the system may not be forked
-        context.set_forkserver_preload(["neuralq.runs.sweep.warm"])
-    ready = {"NEURALQ_WARM": json.dumps(dict(config))} if config and num_threads == 1 else {}
-    process: BaseProcess = context.Process(target=_child, args=(task,), name=task.name)
-    with safe_path(), without_main(), with_environment({**dict.fromkeys(_THREADS, str(num_threads)), **ready}):
-        process.start()
-    return process
-
-
-def _child(task: Task) -> None:
-    os.setsid()  # the terminal's Ctrl-C reaches the parent alone, which passes it on in order
-    log = open_regular(task.log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    for descriptor in (1, 2):
-        os.dup2(log, descriptor)
-    sys.stdout = open(1, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
-    sys.stderr = open(2, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
-    _stop_with_parent()
-    perform(task)
-
-
-def _stop_with_parent() -> None:
-    """Ask this process to stop, as SIGTERM does, as soon as the one that asked for it is gone, however it went."""
-
-    def watch() -> None:
-        parent = multiprocessing.parent_process()
-        assert parent is not None
-        wait([parent.sentinel])
-        os.kill(os.getpid(), signal.SIGTERM)
-        threading.Event().wait(_GRACE_SECONDS)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def reason_of(status: int, log: Path) -> str:
-    """What happened to a process: the signal that killed it, or the last that it printed; "" if it ended well."""
-    if status <= 0:
-        return f"killed by {signal.Signals(-status).name}" if status else ""
-    lines: list[str] = []
-    with contextlib.suppress(OSError), open(open_regular(log, os.O_RDONLY), "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-        lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
-    said = lines[-1].strip().removeprefix("neuralq: ").removeprefix("error: ") if lines else ""
-    return said or f"ended with status {status}"
 
 
 def free_memory() -> int | None:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from neuralq.runs.kinds import KINDS
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
 from neuralq.runs.recipe.keywords import nested, with_body
 from neuralq.runs.recipe.presets import with_preset
@@ -33,6 +34,11 @@ def resolved(base: Mapping[str, Any], options: Mapping[str, Any], seed: int) -> 
     preset = given.pop("preset", True)
     if not given.get("env"):
         raise ValueError("a sweep needs an environment, e.g. env: CartPole-v1")
+    if given["env"] in KINDS:
+        raise ValueError(
+            f"a sweep makes runs on environments, and {given['env']} is none; run its seeds one by one: neuralq train "
+            f"{given['env']} --seed {seed}"
+        )
     plain = {"env": given.pop("env")}
     if preset is False:
         config = config_from_dict(with_body(nested(plain, given)))

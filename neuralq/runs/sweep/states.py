@@ -26,9 +26,21 @@ from neuralq.runs.folder.files import (
 )
 from neuralq.runs.folder.run_folder import is_run_folder, read_summary
 
-__all__ = ["FAILURE", "RunState", "forget_failure", "note_failure", "saved_steps", "state_of", "steps_so_far"]
+__all__ = [
+    "FAILURE",
+    "RunState",
+    "attempts_path",
+    "forget_failure",
+    "is_being_written",
+    "note_failure",
+    "numbered",
+    "saved_steps",
+    "state_of",
+    "steps_so_far",
+]
 
 FAILURE = "failure.json"
+_NUMBER = re.compile(r"[1-9][0-9]*")
 _TAIL_BYTES = 1 << 16
 
 
@@ -63,9 +75,38 @@ def state_of(path: Path, total_steps: int | None = None) -> RunState:
         return RunState("finished", summary=summary)
     if os.path.lexists(path / FAILURE):
         return RunState("failed", _failure_in(path))
-    if _is_being_written(path):
+    if is_being_written(path):
         return RunState("running")
-    return RunState("stopped" if is_run_folder(path) else "not begun")
+    if is_run_folder(path):
+        return RunState("stopped")
+    states = {state_of(attempt, total_steps).state for attempt in numbered(attempts_path(path))}
+    if "running" in states:
+        return RunState("running")
+    return RunState("stopped" if states - {"not begun"} else "not begun")
+
+
+def attempts_path(path: Path) -> Path:
+    """Where a cluster's attempts at the run in a folder are (`neuralq.runs.sweep.attempts`).
+
+    Example:
+        >>> attempts_path(Path("s/seed-3")).as_posix()
+        's/seed-3.attempts'
+    """
+    return path.with_name(f"{path.name}.attempts")
+
+
+def numbered(folder: Path) -> list[Path]:
+    """The attempts in a folder, newest first.
+
+    Example:
+        >>> numbered(Path("/nowhere"))
+        []
+    """
+    try:
+        names = [name for name in os.listdir(folder) if _NUMBER.fullmatch(name)]
+    except OSError:
+        return []
+    return [folder / name for name in sorted(names, key=int, reverse=True)]
 
 
 def _finished(path: Path, total_steps: int | None) -> dict[str, Any] | None:
@@ -84,7 +125,7 @@ def _finished(path: Path, total_steps: int | None) -> dict[str, Any] | None:
     return summary if isinstance(steps, int) and (total_steps is None or steps >= total_steps) else None
 
 
-def _is_being_written(path: Path) -> bool:
+def is_being_written(path: Path) -> bool:
     """Whether another process holds the lock of a folder."""
     try:
         descriptor = open_regular(path / "run.lock", os.O_RDONLY)
@@ -131,7 +172,12 @@ def saved_steps(path: Path) -> int:
 
 
 def steps_so_far(run_dir: Path) -> int:
-    """Environment steps in the last whole line of ``metrics.jsonl``; the file may grow meanwhile."""
+    """Environment steps in the last whole line of ``metrics.jsonl``; the file may grow meanwhile.
+
+    Of a run that has attempts only, those of the newest.
+    """
+    if not run_dir.is_dir():
+        return next((steps_so_far(attempt) for attempt in numbered(attempts_path(run_dir))), 0)
     try:
         with open(open_regular(run_dir / "metrics.jsonl", os.O_RDONLY), "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))

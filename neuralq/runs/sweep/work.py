@@ -17,6 +17,7 @@ from neuralq.runs.folder.run_folder import is_run_folder, read_config
 from neuralq.runs.hooks import watching_hooks
 from neuralq.runs.loop import Hook
 from neuralq.runs.recipe.config import config_from_dict
+from neuralq.runs.sweep.attempts import take_over
 from neuralq.runs.sweep.states import forget_failure, note_failure
 from neuralq.runs.sweep.task import Task
 
@@ -32,6 +33,7 @@ def perform(task: Task) -> None:
     forget_failure(task.path)
     try:
         with _hooks(task) as hooks, _warnings():
+            take_over(task.path, int(task.config["total_steps"]))
             if not is_run_folder(task.path):
                 CONTROL.train(config_from_dict(task.config), task.path, hooks)
             else:
