@@ -327,6 +327,7 @@ def test_a_list_is_one_value_of_an_option_whose_values_are_lists() -> None:
         ({"gamma": {"from": 1, "to": 2, "step": 0}}, "must be a range like"),
         ({"gamma": {"from": "a", "to": 2}}, "must be a range like"),
         ({"gamma": 1, "seeds": 0}, "seeds"),
+        ({"gamma": 1, "seeds": 10**12}, "at most 10,000,000 runs, got 1,000,000,000,000 seeds"),
         ({"gamma": 1, "seeds": [1, 1]}, "each named once"),
         ({"gamma": 1, "seed": 1, "seeds": 2}, "seed and seeds"),
         ({"lambda": 1, "lambda_": 1}, "lambda_ is given twice"),

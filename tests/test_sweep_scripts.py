@@ -159,9 +159,12 @@ def test_the_command_prints_what_a_scheduler_is_given(tmp_path: Path, capsys: py
     assert "#SBATCH --array=0-3\n" in capsys.readouterr().out
     assert main([*words[:1], words[2], "--slurm-script", "--of", "2"]) == 0
     assert "--of 2 --workers 1\n" in capsys.readouterr().out
-    for wrong in (["--slurm-script", "--of", "5"], ["--kubernetes-job"]):
-        assert main([*words, *wrong]) == 2
+    wrong = (["--slurm-script", "--of", "5"], ["--kubernetes-job"], ["--image", "x"], ["--index", "0", "--of", "0"])
+    for options in wrong:
+        assert main([*words, *options]) in (1, 2)
         assert capsys.readouterr().err.count("\n") == 1
+    assert main([*words[:2], words[1], "--slurm-script"]) == 1
+    assert "is a file, and no folder for runs" in capsys.readouterr().err
     assert main([*words, "--kubernetes-job", "--image", "registry/neuralq:1", "--claim", "mine"]) == 0
     job = yaml.safe_load(capsys.readouterr().out)
     assert job["spec"]["completions"] == 4

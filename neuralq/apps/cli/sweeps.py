@@ -171,7 +171,8 @@ def refuse_other_kinds(path: str | Path) -> None:
 
 def make_runs(sweep: Sweep, options: argparse.Namespace) -> int:
     """What ``neuralq sweep`` was asked for beside telling how far a sweep is: its runs, or a share of them."""
-    members = None if options.index is None else share_of(sweep, options.index, options.of or len(sweep))
+    of = len(sweep) if options.of is None else options.of
+    members = None if options.index is None else share_of(sweep, options.index, of)
     again = options.retry_failed
     status = run_to_the_end(sweep, engine_of(sweep, options), options.json, members=members, retry_failed=again)
     return REQUEUE if members is not None and status > 128 else status
