@@ -216,7 +216,7 @@ def test_a_task_whose_time_is_up_saves_and_queues_again(
     assert set(states.values()) == {"COMPLETED"}
     assert bits(tmp_path / "sweep") == long[1]
     logs = [path.read_text() for path in (tmp_path / "sweep").glob("slurm-*_*.log")]
-    assert len(logs) == 2 and all("DUE TO JOB REQUEUE" in log for log in logs)  # the log was appended to
+    assert len(logs) == 2 and all("SIGUSR1: go on with" in log for log in logs)  # appended to
     assert not any("DUE TO TIME LIMIT" in log for log in logs)
 
 
