@@ -5,8 +5,8 @@
 A round is a kill (SIGKILL, at a random time) of one of the runs that go on, each once at most, or of the command
 itself, which is then given again. Sweeps are begun until there have been so many. Of each sweep every run must have
 finished with the parameters (SHA-256) and with the rows of metrics of a sweep that nobody disturbed, so that no step
-was lost or taken twice; what had finished at a kill must not be touched after it, and no process may be left. A line for
-each sweep; the exit status is 1 if any of it did not hold. Needs /proc, so Linux.
+was lost or taken twice; what had finished at a kill must not be touched after it, and no process may be left. A line
+for each sweep; the exit status is 1 if any of it did not hold. Needs /proc, so Linux.
 """
 
 from __future__ import annotations
