@@ -246,3 +246,20 @@ def test_learning_curves_has_a_panel_for_each_environment_and_a_mean_over_its_se
         ]
     )
     assert (steps, means) == ([1, 2], [3.0, 1.5])
+
+
+@pytest.mark.whole
+def test_what_a_machine_with_an_accelerator_is_asked_runs_here_in_a_small_form(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, capsys, "gpu_check.py", "--device=cpu", "--small", f"--out={tmp_path / 'gpu.json'}")
+    assert ended.value.code == 0
+    found = json.loads((tmp_path / "gpu.json").read_text())
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == found and found["ok"]
+    assert len(found["learners"]["difference"]) == 5 and set(found["resume"]["difference"].values()) == {0.0}
+    assert found["rates"]["steps_per_second"]["CartPole-v1, 8"]["ratio"] > 0
+    assert "accelerator" in found["tests"]["left_out"] and "accelerator" in found["graphs"]["left_out"]
+    monkeypatch.setattr(sys, "argv", ["gpu_check.py", "--parts=nothing", "--device=cpu"])
+    with pytest.raises(SystemExit, match="there are the parts tests, learners, resume, rates, graphs, got nothing"):
+        runpy.run_path(str(ROOT / "scripts" / "gpu_check.py"), run_name="__main__")

@@ -19,8 +19,9 @@ import pytest
 from neuralq.runs.folder import checkpoint
 from neuralq.runs.folder.files import RunFolderBusy
 from neuralq.runs.folder.run_folder import RunFolder, read_metrics, read_summary
+from neuralq.runs.sweep import attempts
 from neuralq.runs.sweep.attempts import begin, pack, publish, take_over, unpack
-from neuralq.runs.sweep.states import attempts_path, note_failure, saved_steps, state_of
+from neuralq.runs.sweep.states import attempts_path, note_failure, numbered, saved_steps, state_of
 
 TOTAL = 100
 
@@ -55,18 +56,29 @@ def test_an_attempt_begins_from_the_newest_whole_checkpoint_of_all_before_it(tmp
     assert state_of(path).state == "not begun"
     advance(first, 10, 20, 30)
     assert state_of(path).state == "stopped"
+    with RunFolder.open(first):
+        assert state_of(path).state == "running"
     second = begun(path)  # the first is given up, and goes on all the same
     assert (second.name, saved_steps(second), rows(second)) == ("2", 30, [10, 20, 30])
     assert np.array_equal(checkpoint.load_newest(second / "checkpoints").state["values"], np.full(3, 30))
     assert checkpoint.load_newest(second / "best").step == 30
     advance(second, 40)
     advance(first, 40, 50)
-    next((first / "checkpoints" / "step-000000000050").glob("*.npy")).write_bytes(b"spoilt")
     third = begun(path)
-    assert (third.name, saved_steps(third)) == ("3", 40)
-    assert not (third / "run.lock").exists() and [p.name for p in (third / "checkpoints").iterdir()] == [
-        "step-000000000040"
-    ]
+    assert (third.name, saved_steps(third)) == ("3", 50), "the older attempt was faster"
+    assert numbered(attempts_path(path)) == [third, first], "what holds nothing more is gone"
+    next((third / "checkpoints" / "step-000000000050").glob("*.npy")).write_bytes(b"spoilt")
+    next((first / "checkpoints" / "step-000000000050").glob("*.npy")).write_bytes(b"spoilt")
+    fourth = begun(path)
+    assert [p.name for p in (fourth / "checkpoints").iterdir()] == ["step-000000000040"]
+    assert not (fourth / "run.lock").exists()
+
+
+def test_a_number_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "seed-0"
+    first = begun(path)
+    monkeypatch.setattr(attempts, "numbered", lambda folder: [])  # it was made after this one looked
+    assert begun(path) != first
 
 
 def test_who_ends_first_becomes_the_run_and_the_other_is_thrown_away(tmp_path: Path) -> None:

@@ -135,6 +135,27 @@ def test_what_is_no_cluster_is_said_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("storage", ["shared", "none"])
+def test_a_node_without_neuralq_is_one_line(tmp_path: Path, storage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason="the extra ray is not installed")
+    monkeypatch.chdir(tmp_path)  # workers look into the folder of the command, too
+    from ray.cluster_utils import Cluster
+
+    (tmp_path / "lacks" / "neuralq").mkdir(parents=True)
+    lacks = "raise ModuleNotFoundError(\"No module named 'neuralq'\")\n"
+    (tmp_path / "lacks" / "neuralq" / "__init__.py").write_text(lacks)
+    found: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        found.add_node(num_cpus=1, env_vars={"PYTHONPATH": str(tmp_path / "lacks")})
+        sweep = a_sweep(tmp_path / "s", 0)
+        (run,) = run_sweep(sweep, RayCluster(found.address, sweep.path, storage=storage)).runs
+        assert re.fullmatch(r"node [\d.]+ has no neuralq: install there what is .*, 3 times over", run.reason)
+    finally:
+        found.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_a_command_whose_cluster_loses_its_head_ends_with_one_line(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="the extra ray is not installed")
     from ray.cluster_utils import Cluster

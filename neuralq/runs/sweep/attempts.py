@@ -173,7 +173,6 @@ def _move_aside(path: Path, total_steps: int) -> None:
             os.rename(path, aside)
         with contextlib.suppress(OSError):
             os.replace(_log(path), _log(aside))
-        _unlink(aside / FAILURE)
         if _is_finished(aside, total_steps):
             publish(aside, path, total_steps)
 

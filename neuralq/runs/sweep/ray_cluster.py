@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import math
 import os
+import re
 import signal
 import socket
 import threading
@@ -16,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.checks import MissingExtra, check_choice
-from neuralq.runs.sweep import ray_node
 from neuralq.runs.sweep.engine import Ended
+from neuralq.runs.sweep.ray_node import Shelf, attempt, last_line
 from neuralq.runs.sweep.task import Task
 
 __all__ = ["RayCluster", "require_ray"]
@@ -37,6 +38,8 @@ def require_ray() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
+    # Pages of what Ray's daemons logged would go to standard output whenever a node is lost; read as Ray is imported.
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
     try:
         return importlib.import_module("ray")
     except ImportError as error:
@@ -83,7 +86,7 @@ class RayCluster:
                 "until one comes",
                 stacklevel=2,
             )
-        self._attempt = self._ray.remote(num_cpus=num_cpus, num_gpus=num_gpus, max_retries=-1)(ray_node.attempt)
+        self._attempt = self._ray.remote(num_cpus=num_cpus, num_gpus=num_gpus, max_retries=-1)(attempt)
         self._shelf = self._beside() if storage == "none" else None
 
     def _beside(self) -> Any:
@@ -92,7 +95,7 @@ class RayCluster:
 
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=False)
         options = {"num_cpus": 0, "max_restarts": -1, "max_task_retries": -1, "scheduling_strategy": here}
-        return self._ray.remote(**options)(ray_node.Shelf).remote(self._sweep)
+        return self._ray.remote(**options)(Shelf).remote(self._sweep)
 
     @property
     def title(self) -> str:
@@ -102,7 +105,7 @@ class RayCluster:
     def has_room(self) -> bool:
         """Whether Ray shall be given another task: twice as many as can go on at a time, so that no node waits."""
         now = time.monotonic()
-        if now - self._counted > _COUNTED_SECONDS:
+        if now - self._counted > _COUNTED_SECONDS and _answers(self.address, 1.0):  # else asking would end this process
             self._counted = now
             held = {k: sum(node["Resources"].get(k, 0) for node in self._alive()) for k in self._asks}
             at_a_time = min((held[k] / v for k, v in self._asks.items() if v > 0), default=held["CPU"])
@@ -142,11 +145,13 @@ class RayCluster:
         except exceptions.TaskCancelledError:  # before it had begun
             return ""
         except exceptions.RayTaskError as error:
+            found = re.search(r"ip=([\w.:]+)", str(error))
+            node = found[1] if found else "unknown"
             if "No module named 'neuralq" in str(error):
-                return f"node {error.ip} has no neuralq: install there what is installed here"
-            return f"{_last_line(error)} (on node {error.ip})"
+                return f"node {node} has no neuralq: install there what is installed here"
+            return f"{last_line(error)} (on node {node})"
         except exceptions.RayError as error:
-            return _last_line(error)
+            return last_line(error)
 
     def running(self) -> list[Task]:
         """What Ray was given and has not ended."""
@@ -190,7 +195,7 @@ def _connect(ray: Any, address: str) -> str:
         try:
             ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=False)
         except Exception as error:  # of many kinds: another version of Ray or Python there, no node of it here
-            raise ConnectionError(f"cannot use the cluster at {address!r}: {_last_line(error)}") from error
+            raise ConnectionError(f"cannot use the cluster at {address!r}: {last_line(error)}") from error
     return str(ray.get_runtime_context().gcs_address)
 
 
@@ -213,8 +218,3 @@ def _answers(address: str, seconds: float) -> bool:
             return True
     except (OSError, ValueError, OverflowError):
         return False
-
-
-def _last_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__

@@ -29,7 +29,7 @@ from neuralq.runs.sweep.forked import reason_of, run_forked
 from neuralq.runs.sweep.states import attempts_path, saved_steps
 from neuralq.runs.sweep.task import Task
 
-__all__ = ["Shelf", "attempt"]
+__all__ = ["Shelf", "attempt", "last_line"]
 
 _POLL_SECONDS = 0.2
 _SENDING = 10
@@ -54,7 +54,18 @@ def attempt(sweep: str, name: str, config: Mapping[str, Any], options: tuple[str
                 return _beside_a_shelf(task, shelf, request)
             return _in_a_shared_folder(task, Path(sweep), request)
         except (OSError, RunFolderError) as error:
-            return f"{error} (on node {socket.gethostname()})"
+            return f"{last_line(error)} (on node {socket.gethostname()})"
+
+
+def last_line(error: BaseException) -> str:
+    r"""What an error says; of one that Ray brings from elsewhere, whose traceback comes first, the end.
+
+    Example:
+        >>> last_line(OSError("Traceback (most recent call last):\n  ...\nOSError: No space left on device\n"))
+        'OSError: No space left on device'
+    """
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
 
 
 def _in_a_shared_folder(task: Task, sweep: Path, request: StopRequest) -> str:
