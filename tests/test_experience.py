@@ -7,6 +7,8 @@ once; priorities given to the wrong steps; a rollout saved half collected.
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -17,10 +19,12 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from neuralq.learners import OnlineLearner, OnlineSettings, RolloutLearner, RolloutSettings
+from neuralq.learners import OnlineLearner, OnlineSettings, ReplaySettings, RolloutLearner, RolloutSettings
 from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
-from neuralq.q import TableQ
+from neuralq.q import MLP, TableQ
 from neuralq.q.engine import Loss, TorchEngine
+from neuralq.runs import RunConfig
+from neuralq.runs.recipe.build import build_session
 from neuralq.runs.stream import Interaction, Step
 from neuralq.runs.stream.experience import ReplayExperience, RolloutExperience, Sample
 from neuralq.types import Transition
@@ -280,3 +284,101 @@ def test_traces_learn_the_same_with_and_without_pauses() -> None:
         weights.append(learner.engine.flat.values.clone())
     assert torch.equal(*weights)
     assert bool(weights[0].any())
+
+
+# The numbers of prioritised sampling, of Adam and of Huber's loss.
+
+
+def test_beta_rises_with_the_steps_and_weighs_the_samples() -> None:
+    settings = ReplaySettings(
+        prioritised=True, priority_alpha=0.5, priority_beta=0.2, priority_beta_end=1.0, priority_beta_steps=40,
+        priority_epsilon=0.25,
+    )  # fmt: skip
+    assert [settings.importance(steps) for steps in (0, 10, 40, 99)] == pytest.approx([0.2, 0.4, 1.0, 1.0], abs=1e-12)
+    buffer = ReplayBuffer(300, (), np.int64, num_envs=1, prioritised=settings.priorities)
+    experience = ReplayExperience(buffer, np.random.default_rng(0), 8, 1, 20, 1, 1, importance=settings.importance)
+    for step in steps_of(1, 20):
+        experience.add(step)
+    buffer.update_priorities(np.arange(20), np.arange(20.0))
+    [sample] = experience.draw()
+    assert sample.indices is not None and sample.weight is not None
+    priority = (np.arange(20.0) + 0.25) ** 0.5
+    chances = (priority / priority.sum())[np.asarray(sample.indices)]
+    weights = (20 * chances) ** -0.6  # β after 20 of 40 steps is .6
+    assert sample.weight.numpy() == pytest.approx(weights / weights.max(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "filled"),
+    [
+        ({}, {"adam_epsilon": 1e-8, "huber_delta": 1.0, "priority_beta": None, "priority_beta_steps": None}),
+        ({"optimiser": "sgd", "loss": "squared"}, {"adam_epsilon": None, "huber_delta": None}),
+        ({"distribution": "quantile"}, {"huber_delta": None}),
+        ({"prioritised": True}, {"priority_alpha": 0.6, "priority_beta_end": 0.4, "priority_beta_steps": None}),
+        ({"prioritised": True, "priority_beta_end": 1.0}, {"priority_beta": 0.4, "priority_beta_steps": 100_000}),
+    ],
+)
+def test_what_is_left_out_is_as_it_was(given: dict[str, Any], filled: dict[str, Any]) -> None:
+    settings = ReplaySettings(**given)
+    assert {name: getattr(settings, name) for name in filled} == filled
+    assert ReplaySettings(**dataclasses.asdict(settings)) == settings, "what is stored says what was done"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"priority_alpha": 0.5}, "priority_alpha=0.5 would be ignored: prioritised=False"),
+        ({"priority_beta_end": 1.0}, "prioritised=False weighs none"),
+        ({"prioritised": True, "priority_beta_steps": 9}, "would be ignored: priority_beta_end is what priority_beta"),
+        ({"prioritised": True, "priority_beta": 1.5}, "priority_beta must"),
+        ({"prioritised": True, "priority_epsilon": 0.0}, "priority_epsilon must"),
+        ({"adam_epsilon": 0.0}, "adam_epsilon must"),
+        ({"optimiser": "sgd", "adam_epsilon": 1e-4}, "adam_epsilon=0.0001 would be ignored: optimiser='sgd'"),
+        ({"loss": "squared", "huber_delta": 2.0}, "huber_delta=2.0 would be ignored"),
+        ({"huber_delta": -1.0}, "huber_delta must"),
+    ],
+)
+def test_a_number_that_would_be_ignored_or_means_nothing_is_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        ReplaySettings(**given)
+
+
+def test_the_epsilon_of_adam_reaches_a_rollout() -> None:
+    session = build_session(RunConfig(body=MLP((4,)), rollout=RolloutSettings(num_envs=1, adam_epsilon=0.5)))
+    learner: Any = session.learner
+    assert learner._descent._state.optimiser.eps == 0.5
+    for given, said in (({"optimiser": "sgd"}, "would be ignored"), ({"adam_epsilon": 0.0}, "adam_epsilon must")):
+        with pytest.raises(ValueError, match=said):
+            RolloutSettings(**{"adam_epsilon": 0.5, **given})
+
+
+@pytest.mark.parametrize("engine", ["torch", "compiled"])
+def test_the_constants_of_adam_and_of_hubers_loss_reach_the_step(engine: str) -> None:
+    """Against torch's own Adam and Huber loss, for an error of 3 with a loss that is linear from 2 on."""
+    config = RunConfig(
+        env="CartPole-v1", learner="replay", body=MLP((4,)), engine=engine, reward_scale=1.0,
+        replay=ReplaySettings(learning_rate=0.1, adam_epsilon=0.5, huber_delta=2.0, max_grad_norm=None, batch_size=1),
+    )  # fmt: skip
+    session = build_session(config)
+    learner: Any = session.learner
+    weights = learner.engine.flat.values.clone().requires_grad_()
+    s = torch.from_numpy(session.stream.state_dict()["s"])
+    one, zero = torch.ones(1), torch.zeros(1)
+    learner.update(Transition(s, zero.long(), one, 3 * one, zero, s, one > 0))
+    inner = learner.engine.q
+    expected = torch.optim.Adam([weights], 0.1, eps=0.5)
+    with torch.no_grad():
+        before = weights.clone()
+    values = torch.func.functional_call(inner, _unflattened(inner, weights), (s,))
+    torch.nn.functional.huber_loss(values[0, 0], torch.tensor(3.0, dtype=values.dtype), delta=2.0).backward()
+    expected.step()
+    assert not torch.equal(before, weights)
+    assert learner.engine.flat.values.numpy() == pytest.approx(weights.detach().numpy(), abs=1e-6)
+
+
+def _unflattened(module: torch.nn.Module, flat: Tensor) -> dict[str, Tensor]:
+    found, at = {}, 0
+    for name, parameter in module.named_parameters():
+        found[name] = flat[at : at + parameter.numel()].view_as(parameter)
+        at += parameter.numel()
+    return found

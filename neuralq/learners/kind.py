@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -123,6 +123,9 @@ class LearnerKind:
         step_sizes: settings that a run may go on with otherwise than it began.
         on_table: ``on_table(given)``: defaults of settings over a table, where a sample moves one entry, so that a step
             that suits the weights of a network is much too small; left out where a step size is given.
+        space: settings that are worth tuning and where to look, as `neuralq.runs.tune.space` reads them; each is tried
+            over the preset of an environment, whose own value is looked at in any case.
+        updates_per_step: gradient steps for each environment step, which is what a run costs beside the environment.
     """
 
     name: str
@@ -141,6 +144,8 @@ class LearnerKind:
     place: int = 100
     step_sizes: tuple[str, ...] = ()
     on_table: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda given: {}
+    space: Mapping[str, Any] = field(default_factory=dict)
+    updates_per_step: Callable[[Any], float] = lambda settings: 1.0
 
     def settings_for(self, layout: str, given: Mapping[str, Any]) -> Any:
         """The settings where some are given, for a layout.

@@ -42,6 +42,7 @@ class RolloutSettings:
         num_minibatches: parts each pass is split into.
         learning_rate: of the optimiser.
         optimiser: "radam", "adam" or "sgd".
+        adam_epsilon: what Adam and RAdam add to the root of the second moment; None for 1e-8.
         max_grad_norm: bound on the gradient's norm; None for none.
         target_period_updates: rollouts between copies into a target network; None for no target network.
         anneal: whether the learning rate falls linearly over the run's steps.
@@ -63,6 +64,7 @@ class RolloutSettings:
     num_minibatches: int = 4
     learning_rate: float = 1e-3
     optimiser: str = "radam"
+    adam_epsilon: float | None = None
     max_grad_norm: float | None = 10.0
     target_period_updates: int | None = None
     anneal: bool = False
@@ -79,6 +81,10 @@ class RolloutSettings:
         for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
             check_whole(name, getattr(self, name))
         check_positive("learning_rate", self.learning_rate)
+        if self.optimiser == "sgd" and self.adam_epsilon is not None:
+            raise ValueError("adam_epsilon would be ignored with optimiser='sgd'; leave it out")
+        if self.adam_epsilon is not None:
+            check_positive("adam_epsilon", self.adam_epsilon)
         Optimiser(self.optimiser)
         if self.max_grad_norm is not None:
             check_positive("max_grad_norm", self.max_grad_norm)
@@ -99,6 +105,12 @@ class RolloutSettings:
         if self.num_minibatches > self.num_envs * self.num_steps:
             rows = self.num_envs * self.num_steps
             raise ValueError(f"num_minibatches={self.num_minibatches} exceeds the {rows} samples of a rollout")
+
+    @property
+    def optimiser_constants(self) -> Optimiser:
+        """The optimiser with its constants."""
+        own = {} if self.adam_epsilon is None else {"eps": self.adam_epsilon}
+        return Optimiser(self.optimiser, **own)
 
 
 class RolloutLearner:
@@ -139,7 +151,7 @@ class RolloutLearner:
         self.reward_scale = reward_scale
         self.num_updates = 0
         self.total_updates = total_updates
-        self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._descent = Descent(engine, settings.optimiser_constants, settings.learning_rate, settings.max_grad_norm)
         self._has_memory = has_memory(engine)
         self._average: IterateAverage | None = None
         if settings.average_updates is not None:
@@ -299,4 +311,17 @@ ROLLOUT = LearnerKind(
     place=1,
     step_sizes=("learning_rate",),
     on_table=_on_table,
+    space={
+        "learning_rate": {"from": 1e-4, "to": 5e-3, "scale": "log"},
+        "lambda_": {"from": 0.3, "to": 1.0},
+        "num_envs": [8, 16, 32],
+        "num_steps": [16, 32, 64, 128],
+        "num_epochs": {"from": 1, "to": 12, "scale": "log"},
+        "num_minibatches": [4, 8, 16, 32],
+        "anneal": [True, False],
+        "refresh_targets": [True, False],
+        "average_updates": {"from": 2.0, "to": 64.0, "scale": "log", "or": None},
+        "normalise_observations": [True, False],
+    },
+    updates_per_step=lambda s: s.num_epochs * s.num_minibatches / (s.num_envs * s.num_steps),
 )

@@ -63,6 +63,7 @@ COMMANDS = {
     "evaluate": _of("runs", "evaluate", "play greedy episodes with a trained run", _LOOK),
     "sweep": _of("sweep", "sweep", "a run for every combination of options and seed, here or on a cluster", _LOOK),
     "report": _of("runs", "report", "write a run's report.html", _LOOK),
+    "tune": _of("tune", "tune", "look for better options than a preset's, confirmed on fresh seeds", _LOOK),
     "compare": _of("compare", "compare", "table and plot of several runs or sweeps side by side", _LOOK),
     "presets": _of("presets", "presets", "an overview of tuned settings, or one of them whole", _LOOK),
     "watch": _of("media", "watch", "watch a trained run play in a window", _LOOK),

@@ -19,7 +19,7 @@ from neuralq.runs.sweep.folder import Member, Sweep, ask, is_sweep_folder, open_
 from neuralq.runs.sweep.scripts import kubernetes_job, num_shares, slurm_script
 from neuralq.runs.sweep.states import RunState
 
-__all__ = ["sweep"]
+__all__ = ["add_cluster", "sweep"]
 
 _MOST_REASONS = 20
 
@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("what", nargs="+", metavar="FILE.yaml DIR", help="what is asked for, and where the runs go")
     parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
-    _add_cluster(parser)
+    add_cluster(parser)
     parser.add_argument("--status", action="store_true", help="tell how far each run is, and make none")
     parser.add_argument("--retry-failed", action="store_true", help="begin runs again that have failed")
     parser.add_argument("--index", type=int, metavar="I", help="make one share of the runs, counted from 0")
@@ -85,7 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_cluster(parser: argparse.ArgumentParser) -> None:
+def add_cluster(parser: argparse.ArgumentParser) -> None:
+    """Adds what says where on a cluster runs are made."""
     parser.add_argument(
         "--ray", metavar="ADDRESS",
         help="make the runs on a Ray cluster that this machine belongs to: HOST:PORT of its head, or auto (extra ray)",

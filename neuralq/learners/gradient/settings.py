@@ -174,4 +174,11 @@ GRADIENT = LearnerKind(
     place=5,
     step_sizes=("step_size", "step_size_h"),
     on_table=_on_table,
+    space={
+        "step_size": {"from": 1e-5, "to": 3e-3, "scale": "log"},
+        "step_size_h": {"from": 1e-6, "to": 1e-3, "scale": "log"},
+        "beta": {"from": 0.1, "to": 3.0, "scale": "log"},
+        "lambda_": {"from": 0.0, "to": 0.95},
+        "anneal": [True, False],
+    },
 )

@@ -18,7 +18,6 @@ from torch import Tensor
 from neuralq.learners import state
 from neuralq.learners.descent import Descent
 from neuralq.learners.learner import Update
-from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.distributions.record import Distribution, Moved, distributions
 from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
 from neuralq.learners.replay.settings import ReplaySettings
@@ -71,7 +70,7 @@ class DistributionalLearner:
         self.rng = np.random.default_rng(0) if rng is None else rng
         self.num_updates = 0
         self._options = settings.options
-        self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._descent = Descent(engine, settings.optimiser_constants, settings.learning_rate, settings.max_grad_norm)
         self._average = average_for(engine, settings)
         self._parts = {"descent": self._descent, "average": self._average}
         engine.sync_target()

@@ -25,7 +25,7 @@ from neuralq.learners import state
 from neuralq.learners.gradient.correction import HeadCorrection
 from neuralq.learners.gradient.differentiation import gradient, greedy_value, module_parameters
 from neuralq.learners.learner import Update
-from neuralq.learners.optim import FlatOptimiser, Optimiser, clip_norm_
+from neuralq.learners.optim import FlatOptimiser, clip_norm_
 from neuralq.learners.replay.settings import ReplaySettings
 from neuralq.q.bodies import Trunk
 from neuralq.q.compiled import MlpEngine
@@ -148,8 +148,8 @@ class DQRCLearner:
         self._parameters = module_parameters(engine.q)
         self._parameters_h = module_parameters(head)
         self._beta, self._rate_h = settings.options["dqrc_beta"], settings.options["dqrc_learning_rate"]
-        self._state = FlatOptimiser(Optimiser(settings.optimiser), engine.flat.values)
-        self._state_h = FlatOptimiser(Optimiser(settings.optimiser), self._correction.values)
+        self._state = FlatOptimiser(settings.optimiser_constants, engine.flat.values)
+        self._state_h = FlatOptimiser(settings.optimiser_constants, self._correction.values)
         optimisers = {"optimiser": self._state, "optimiser_h": self._state_h}
         self._parts = {"parameters": engine.flat, "h": self._correction.values, **optimisers}
 

@@ -73,6 +73,13 @@ def _check(settings: ReplaySettings, representation: Representation) -> None:
         raise ValueError("engine='compiled' has no kernels for dueling streams or distributions; use engine='auto'")
 
 
+def _loss(settings: ReplaySettings) -> Loss:
+    """Of a mean; distributions have losses of their own."""
+    if settings.loss != "huber":
+        return Loss("squared")
+    return Loss("huber") if settings.huber_delta is None else Loss("huber", settings.huber_delta)
+
+
 def _on_table(given: Mapping[str, Any]) -> dict[str, Any]:
     """Plain steps that bring an entry a twentieth nearer to each of its samples, all of them kept; an average plays.
 
@@ -112,11 +119,22 @@ REPLAY = LearnerKind(
         replay=True,
         double=s.rule is DOUBLE,
     ),
-    loss=lambda s: Loss("huber" if s.loss == "huber" else "squared"),
+    loss=_loss,
     outputs=lambda s, layout: s.returns.outputs(s, layout),
     represent=_represented,
     check=_check,
     place=2,
     step_sizes=("learning_rate", "dqrc_learning_rate"),
     on_table=_on_table,
+    space={
+        "learning_rate": {"from": 1e-4, "to": 5e-3, "scale": "log"},
+        "target_rule": ["q_learning", "double"],
+        "num_steps": {"from": 1, "to": 10, "scale": "log"},
+        "batch_size": [32, 64, 128, 256],
+        "train_period": [1, 2, 4, 8],
+        "target_rate": {"from": 0.002, "to": 0.05, "scale": "log", "or": None},
+        "target_period_updates": {"from": 50, "to": 2_000, "scale": "log", "when": {"target_rate": None}},
+        "average_updates": {"from": 100.0, "to": 10_000.0, "scale": "log", "or": None},
+    },
+    updates_per_step=lambda s: s.updates_per_period / s.train_period,
 )

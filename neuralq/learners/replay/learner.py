@@ -12,7 +12,6 @@ from torch import Tensor
 from neuralq.learners import state
 from neuralq.learners.descent import Descent
 from neuralq.learners.learner import Update
-from neuralq.learners.optim import Optimiser
 from neuralq.learners.replay.conservative import conservative_gradient
 from neuralq.learners.replay.distributions.record import MEAN
 from neuralq.learners.replay.iterates import average_for, evaluation_parameters, finish_update
@@ -60,7 +59,7 @@ class ReplayLearner:
         self.settings = settings
         self.reward_scale = reward_scale
         self.num_updates = 0
-        self._descent = Descent(engine, Optimiser(settings.optimiser), settings.learning_rate, settings.max_grad_norm)
+        self._descent = Descent(engine, settings.optimiser_constants, settings.learning_rate, settings.max_grad_norm)
         self._average = average_for(engine, settings)
         self._has_memory = has_memory(engine)
         self._parts = {"descent": self._descent, "average": self._average}

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from neuralq.checks import check_choice, check_fraction, check_positive, check_whole
 from neuralq.learners.optim import Optimiser
+from neuralq.learners.replay.arrays import Prioritised
 from neuralq.learners.replay.distributions.record import MEAN, Distribution, distributions
 from neuralq.rules import Option, TargetRule, target_rules
 
@@ -74,9 +75,18 @@ class ReplaySettings:
             et al., 2018).
         learning_rate: of the optimiser.
         optimiser: "adam", "radam" or "sgd".
+        adam_epsilon: what Adam and RAdam add to the root of the second moment; None for 1e-8 (Mnih et al., 2015, have
+            1e-2, Hessel et al., 2018, 1.5e-4).
         loss: "huber" or "squared"; None for the rule's own (Huber's; of dqrc squared, of categories cross-entropy).
+        huber_delta: |δ| in units of scaled rewards from which Huber's loss of a mean is linear; None for 1.
         max_grad_norm: bound on the gradient's norm; None for none.
         prioritised: whether samples are drawn by |δ| (Schaul et al., 2016), with importance weights in the loss.
+        priority_alpha: α, samples are drawn in proportion to (|δ| + ε)^α; None for 0.6, 0 is uniform.
+        priority_beta: β of the importance weights (N·P)^−β; None for 0.4, 1 takes back the whole bias.
+        priority_beta_end: β after ``priority_beta_steps``, reached linearly (Schaul et al., 2016, end at 1); None for
+            the same as at the beginning.
+        priority_beta_steps: environment steps; None for 100,000 where β moves.
+        priority_epsilon: ε, so that no sample is forgotten for good; None for 1e-6.
         distribution: DISTRIBUTIONS.
         num_atoms: numbers that describe a distribution; None for ATOMS.
         value_min: smallest return of a categorical distribution, in the environment's units.
@@ -108,9 +118,16 @@ class ReplaySettings:
     noisy: bool = False
     learning_rate: float = 5e-4
     optimiser: str = "adam"
+    adam_epsilon: float | None = None
     loss: str | None = None
+    huber_delta: float | None = None
     max_grad_norm: float | None = 10.0
     prioritised: bool = False
+    priority_alpha: float | None = None
+    priority_beta: float | None = None
+    priority_beta_end: float | None = None
+    priority_beta_steps: int | None = None
+    priority_epsilon: float | None = None
     distribution: str = "none"
     num_atoms: int | None = None
     value_min: float | None = None
@@ -158,6 +175,40 @@ class ReplaySettings:
         """The target rule's own numbers by name."""
         return {name: getattr(self, name) for name in self.rule.options}
 
+    @property
+    def optimiser_constants(self) -> Optimiser:
+        """The optimiser with its constants."""
+        return (
+            Optimiser(self.optimiser) if self.adam_epsilon is None else Optimiser(self.optimiser, eps=self.adam_epsilon)
+        )
+
+    @property
+    def priorities(self) -> Prioritised | None:
+        """How samples are drawn; None for all alike."""
+        if self.priority_alpha is None or self.priority_beta is None or self.priority_epsilon is None:
+            return None
+        return Prioritised(self.priority_alpha, self.priority_beta, self.priority_epsilon)
+
+    def importance(self, num_steps: int) -> float | None:
+        """β after so many environment steps; None where all samples weigh the same.
+
+        Example:
+            >>> settings = ReplaySettings(prioritised=True, priority_beta_end=1.0, priority_beta_steps=1000)
+            >>> settings.importance(500), settings.importance(5000), ReplaySettings().importance(0)
+            (0.7, 1.0, None)
+        """
+        begin, end, steps = self.priority_beta, self.priority_beta_end, self.priority_beta_steps
+        if begin is None or end is None or steps is None:
+            return begin
+        return begin + (end - begin) * min(1.0, num_steps / steps)
+
+    def _fill_in_priorities(self) -> None:
+        for name, default in (("priority_alpha", 0.6), ("priority_beta", 0.4), ("priority_epsilon", 1e-6)):
+            _settle(self, name, default, self.prioritised, "prioritised=False draws all samples alike")
+        _settle(self, "priority_beta_end", self.priority_beta, self.prioritised, "prioritised=False weighs none")
+        moves = self.prioritised and self.priority_beta_end != self.priority_beta
+        _settle(self, "priority_beta_steps", 100_000, moves, "priority_beta_end is what priority_beta is")
+
     def _fill_in(self) -> None:
         """Numbers that the rule needs and nobody gave; those that it has no use for must not be given."""
         rule, learned, own = (
@@ -173,6 +224,10 @@ class ReplaySettings:
             )
             what = rule if self.rule.correction else learned
             raise ValueError(f"loss={self.loss!r} does not go with {what}, which has {losses[0]!r}; leave loss out")
+        _settle(self, "adam_epsilon", 1e-8, self.optimiser != "sgd", "optimiser='sgd' divides by nothing")
+        linear = self.loss == "huber" and self.returns is MEAN
+        _settle(self, "huber_delta", 1.0, linear, "it is of Huber's loss of a mean")
+        self._fill_in_priorities()
         why = f"{rule} {self.rule.correction}"
         for name in ("target_rate", "average_updates"):
             _settle(self, name, None, not self.rule.correction, why)
@@ -192,6 +247,14 @@ class ReplaySettings:
             _settle(self, name, default, name in own, f"{rule} {option.lack}")
 
     def _check_own_numbers(self) -> None:
+        for name in ("priority_alpha", "priority_beta", "priority_beta_end"):
+            if getattr(self, name) is not None:
+                check_fraction(name, getattr(self, name))
+        for name in ("priority_epsilon", "adam_epsilon", "huber_delta"):
+            if getattr(self, name) is not None:
+                check_positive(name, getattr(self, name))
+        if self.priority_beta_steps is not None:
+            check_whole("priority_beta_steps", self.priority_beta_steps)
         if self.target_rate is not None and not 0 < self.target_rate <= 1:
             raise ValueError(f"target_rate must lie in (0, 1], got {self.target_rate}; 0.005 is usual, 1 copies")
         if self.average_updates is not None and not 1 <= self.average_updates < float("inf"):

@@ -279,4 +279,16 @@ TABULAR = LearnerKind(
     layout="table",
     place=6,
     step_sizes=("step_size", "power", "turn_visits"),
+    space={
+        "algorithm": ["q-learning", "sarsa", "expected-sarsa", "double"],
+        "schedule": ["constant", "one-over-n", "power", "search-then-converge"],
+        "step_size": {
+            "from": 0.01,
+            "to": 1.0,
+            "scale": "log",
+            "when": {"schedule": ["constant", "search-then-converge"]},
+        },
+        "power": {"from": 0.51, "to": 1.0, "when": {"schedule": "power"}},
+        "turn_visits": {"from": 10.0, "to": 10_000.0, "scale": "log", "when": {"schedule": "search-then-converge"}},
+    },
 )

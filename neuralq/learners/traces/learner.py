@@ -276,4 +276,10 @@ ONLINE = LearnerKind(
     place=3,
     step_sizes=("step_size",),
     on_table=lambda given: {"step_size": 0.1, "lambda_": 0.5, "anneal": given.get("trace") != "dutch"},
+    space={
+        "step_size": {"from": 1e-4, "to": 1e-2, "scale": "log"},
+        "lambda_": {"from": 0.0, "to": 0.95},
+        "cut": ["watkins", "naive"],
+        "anneal": [True, False],
+    },
 )

@@ -316,4 +316,11 @@ STREAMING = LearnerKind(
     place=4,
     step_sizes=("step_size",),
     on_table=lambda given: {"step_size": 0.1, "lambda_": 0.5, "anneal": True},
+    space={
+        "lambda_": {"from": 0.3, "to": 0.98},
+        "bound": ["obgd", "adaptive-obgd"],
+        "step_size": {"from": 0.1, "to": 3.0, "scale": "log"},
+        "kappa": {"from": 1.1, "to": 5.0, "scale": "log"},
+        "anneal": [True, False],
+    },
 )

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.runs.folder.env_probe import Resumability
 from neuralq.runs.offline.recorded import Recorded
 from neuralq.runs.stream import Interaction, Step
@@ -126,7 +126,7 @@ def whole_buffer(rows: tuple[Array, ...], settings: Any) -> ReplayBuffer:
     for capacity in (count, 2 * count):  # short episodes of large observations take more room
         buffer = ReplayBuffer(
             capacity, rows[0].shape[1:], rows[0].dtype, num_steps=settings.num_steps,
-            prioritised=Prioritised() if settings.prioritised else None,
+            prioritised=settings.priorities,
         )  # fmt: skip
         buffer.add(steps)
         if len(buffer) == count:

@@ -18,7 +18,7 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from neuralq.learners import HasEngineName, HasValues, Learner, Parts
-from neuralq.learners.replay.buffer import Prioritised, ReplayBuffer
+from neuralq.learners.replay.buffer import ReplayBuffer
 from neuralq.q import (
     ActionInputQ,
     ActionOutputQ,
@@ -206,7 +206,7 @@ def _with_data(config: RunConfig, session: Session) -> Session:
     rows = rows_of(data, stream.encoder, first_action, stream.num_actions, config.gamma)
     drawing = ReplayExperience(
         whole_buffer(rows, settings), session.generators["samples"], settings.batch_size, settings.block_length,
-        settings.train_period, settings.train_period, settings.updates_per_period,
+        settings.train_period, settings.train_period, settings.updates_per_period, importance=settings.importance,
     )  # fmt: skip
     session.stream, session.experience = (
         Playback(stream, data, config.dataset),
@@ -331,6 +331,7 @@ def _replay(settings: Any, spec: ObservationSpec, rng: np.random.Generator) -> E
     return ReplayExperience(
         buffer, rng, settings.batch_size, settings.block_length,
         settings.learning_starts, settings.train_period, settings.updates_per_period, settings.burn_in,
+        settings.importance,
     )  # fmt: skip
 
 
@@ -344,7 +345,7 @@ _SOURCES = {"rollouts": _rollouts, "replay": _replay, "steps": _steps}
 def _buffer(settings: Any, spec: ObservationSpec, capacity: int) -> ReplayBuffer:
     return ReplayBuffer(
         capacity, spec.shape, spec.dtype, num_envs=settings.num_envs, num_steps=settings.num_steps,
-        prioritised=Prioritised() if settings.prioritised else None,
+        prioritised=settings.priorities,
     )  # fmt: skip
 
 

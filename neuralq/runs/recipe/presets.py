@@ -335,6 +335,8 @@ def yielding(settings: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
     rule = target_rules().get(given.get("target_rule", ""))
     if rule is not None and rule.correction:
         gone |= _OF_FROZEN_TARGETS
+    if given.get("anneal") is False:
+        gone |= {"anneal_env_steps", "anneal_to"}
     return {name: value for name, value in settings.items() if name not in gone}
 
 

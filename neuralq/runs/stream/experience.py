@@ -6,7 +6,7 @@ one is full, or every step as it comes; `ReplayExperience` draws from a replay b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -153,6 +153,8 @@ class ReplayExperience:
         train_period: environment steps between samples.
         updates_per_period: samples at each of those times.
         burn_in: rows of a block before those that are learned from.
+        importance: of the steps stored so far, β of the importance weights of prioritised samples; None for that of
+            the buffer.
     """
 
     buffer: ReplayBuffer
@@ -163,6 +165,7 @@ class ReplayExperience:
     train_period: int
     updates_per_period: int
     burn_in: int = 0
+    importance: Callable[[int], float | None] | None = None
 
     def __post_init__(self) -> None:
         """Nothing is stored yet."""
@@ -192,7 +195,8 @@ class ReplayExperience:
                     length = self.burn_in + self.block_length
                     yield Sample(self.buffer.sample_blocks(blocks, length, self.rng))
                     continue
-                batch = self.buffer.sample(self.batch_size, self.rng)
+                beta = None if self.importance is None else self.importance(self._num_added)
+                batch = self.buffer.sample(self.batch_size, self.rng, beta=beta)
                 if self.buffer.prioritised is None:
                     yield Sample(batch.transition)
                 else:
