@@ -142,9 +142,9 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         }
         for env in ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")
     },
-    # PQN's settings on MinAtar (Gallici et al., 2024); published over 10,000,000 steps, ε over the first tenth of them as
-    # here. Our layer norm after the convolution is over all its outputs, theirs over channels: 134,483 parameters, not
-    # 132,467.
+    # PQN's settings on MinAtar (Gallici et al., 2024), published over 10,000,000 steps, ε over the first tenth of them
+    # as here. Our layer norm after the convolution is over all its outputs (134,483 parameters), theirs over channels
+    # (132,467).
     **{
         (f"MinAtar/{game}-v1", "rollout"): {
             **_MINATAR,
