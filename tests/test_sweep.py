@@ -400,8 +400,8 @@ def test_lines_for_people_and_their_pace(tmp_path: Path) -> None:
             now[0] = float(second)
             bar(status)
     assert out.getvalue().splitlines() == [
-        "0 of 3 seeds · 1,100 of 3,000 steps · 100 steps/s",
-        "1 of 3 seeds · failed: 1 · 2,000 of 3,000 steps · 167 steps/s · IQM 50.0",
+        "19 s left · 0 of 3 seeds · 1,100 of 3,000 steps · 100 steps/s",
+        "6 s left · 1 of 3 seeds · failed: 1 · 2,000 of 3,000 steps · 167 steps/s · IQM 50.0",
     ]
 
 
