@@ -1,4 +1,4 @@
-"""``neuralq tune`` as a process: killed, interrupted, gone on with; and what it leaves is what ``neuralq train`` takes."""
+"""``neuralq tune`` as a process: killed, interrupted, gone on with; ``neuralq train`` takes what it leaves."""
 
 from __future__ import annotations
 
@@ -76,7 +76,8 @@ def test_killed_and_interrupted_it_comes_to_what_it_would_have_come_to(tmp_path:
     when(killed, process, 23)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=300)
-    assert process.returncode == 130 and (again := re.search(r"go on with: neuralq (tune .*)", err)) is not None, err
+    again = re.search(r"go on with: neuralq (tune .*)", err)
+    assert process.returncode == 130 and again is not None, err
     said = subprocess.run([sys.executable, "-m", "neuralq", *shlex.split(again[1])], capture_output=True, text=True)
     assert said.returncode == 0 and "report" in said.stdout, said.stderr
     assert result(open_study(killed)) == result(open_study(whole))
