@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from neuralq.apps.cli import main
+from neuralq.runs.evaluation import shown
 from neuralq.runs.folder.run_folder import read_summary
 from neuralq.runs.tune.confirming import confirmed, winner
 from neuralq.runs.tune.study import Study, open_study
@@ -92,8 +93,8 @@ def test_what_is_recommended_is_what_was_confirmed(tmp_path: Path, capsys: pytes
     command = re.search(r"train with it: neuralq (train .*)", out)
     assert command is not None, err
     study = open_study(folder)
-    best = winner(confirmed(study))
-    assert best is not None
+    best, first = winner(confirmed(study)), max(confirmed(study), key=lambda one: one.searched.iqm)
+    assert best is not None and f"flattered by {shown(first.flattery)}" in out
     seed = study.fresh_seeds[3]
     assert main([*shlex.split(command[1]), "--seed", str(seed), "--run-dir", str(tmp_path / "run")]) == 0
     confirmed_run = read_summary(study.task(best.trial, seed).path)

@@ -177,8 +177,12 @@ def _conclude(study: Study, why: str, options: argparse.Namespace) -> int:
     report = write_tune_report(study)
     lines = [f"{len(study.trials)} trials; {'interrupted' if interrupted else why}", verdict(study)]
     if best is not None:
-        flattered = f"the race had it at {shown(best.searched.iqm)}, {shown(best.flattery)} above"
-        lines += [flattered, f"train with it: neuralq train {study.start.plain['env']} --config {preset}"]
+        ahead = max(found, key=lambda one: one.searched.iqm)
+        name = f"trial {ahead.trial.number}" if ahead.trial.number else "the preset"
+        lines.append(
+            f"the race had {name} ahead with {shown(ahead.searched.iqm)}: flattered by {shown(ahead.flattery)}"
+        )
+        lines += [f"train with it: neuralq train {study.start.plain['env']} --config {preset}"]
     missing = {trial.number for trial in candidates(study)} - {one.trial.number for one in found}
     if missing and not interrupted:
         lines.append(f"not confirmed for want of time: trial{'s' * (len(missing) > 1)} {_joined(missing)}")
