@@ -327,6 +327,7 @@ def test_a_list_is_one_value_of_an_option_whose_values_are_lists() -> None:
         ({"gamma": {"from": 1, "to": 2, "step": 0}}, "must be a range like"),
         ({"gamma": {"from": "a", "to": 2}}, "must be a range like"),
         ({"gamma": 1, "seeds": 0}, "seeds"),
+        ({"gamma": 1, "seeds": 10**12}, "at most 10,000,000 runs, got 1,000,000,000,000 seeds"),
         ({"gamma": 1, "seeds": [1, 1]}, "each named once"),
         ({"gamma": 1, "seed": 1, "seeds": 2}, "seed and seeds"),
         ({"lambda": 1, "lambda_": 1}, "lambda_ is given twice"),
@@ -399,8 +400,8 @@ def test_lines_for_people_and_their_pace(tmp_path: Path) -> None:
             now[0] = float(second)
             bar(status)
     assert out.getvalue().splitlines() == [
-        "0 of 3 seeds · 1,100 of 3,000 steps · 100 steps/s",
-        "1 of 3 seeds · failed: 1 · 2,000 of 3,000 steps · 167 steps/s · IQM 50.0",
+        "19 s left · 0 of 3 seeds · 1,100 of 3,000 steps · 100 steps/s",
+        "6 s left · 1 of 3 seeds · failed: 1 · 2,000 of 3,000 steps · 167 steps/s · IQM 50.0",
     ]
 
 

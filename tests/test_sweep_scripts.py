@@ -52,7 +52,7 @@ def perform(place: Path, job: str, told: bool = False, restarts: int = 0, second
     return status, asked.read_text() if asked.exists() else ""
 
 
-SAVES = "trap 'exit {}' USR1; echo ready; while :; do sleep .01; done"
+SAVES = "trap 'exit {}' USR1; echo ready; for _ in {{1..2000}}; do sleep .01; done"
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_task_without_time_to_work_does_not_queue_for_ever(place: Path) -> Non
     assert perform(place, "exit 75", restarts=2) == (75, "requeue 12_3\n")
     (place.parent / "asked").unlink()
     assert perform(place, "exit 75", restarts=3) == (75, "")
-    assert perform(place, "exit 75", restarts=3, seconds=60) == (75, "requeue 12_3\n")  # where bash begins to count
+    assert perform(place, "exit 75", restarts=3, seconds=30) == (75, "requeue 12_3\n")  # where bash begins to count
     (place.parent / "asked").unlink()
     (place.parent / "scontrol").unlink()
     assert perform(place, "exit 75") == (75, "")  # where there is no scontrol
@@ -88,7 +88,7 @@ def test_a_task_without_time_to_work_does_not_queue_for_ever(place: Path) -> Non
 def test_the_script_is_sound_and_its_words_arrive_whole(place: Path) -> None:
     perform(place, "exit 0")
     words = (place.parent / "words").read_text().splitlines()
-    assert words == ["-m", "neuralq", "sweep", str(place), "--index", "3", "--of", "24"]
+    assert words == ["-m", "neuralq", "sweep", str(place), "--index", "3", "--of", "24", "--workers", "1"]
     script = place.parent / "script"
     subprocess.run(["bash", "-n", str(script)], check=True)
     if shutil.which("shellcheck"):
@@ -134,7 +134,7 @@ def test_a_job_of_kubernetes_tells_what_is_lost_from_what_failed() -> None:
     assert container["resources"]["limits"] == {"memory": "2Gi", "nvidia.com/gpu": "1"}
     # As the kubelet writes it (k8s.io/kubernetes/third_party/forked/golang/expansion): "$(X)" is X, "$$" is "$".
     words = [word.replace("$(JOB_COMPLETION_INDEX)", "2").replace("$$", "$") for word in container["args"]]
-    assert words == ["sweep", "/sweeps/a $(HOSTNAME) sweep", "--index", "2", "--of", "3"]
+    assert words == ["sweep", "/sweeps/a $(HOSTNAME) sweep", "--index", "2", "--of", "3", "--workers", "1"]
     with pytest.raises(ValueError, match="--image"):
         kubernetes_job("/data", 3, " ")
 
@@ -158,10 +158,13 @@ def test_the_command_prints_what_a_scheduler_is_given(tmp_path: Path, capsys: py
     assert main([*words, "--slurm-script"]) == 0
     assert "#SBATCH --array=0-3\n" in capsys.readouterr().out
     assert main([*words[:1], words[2], "--slurm-script", "--of", "2"]) == 0
-    assert "--of 2\n" in capsys.readouterr().out
-    for wrong in (["--slurm-script", "--of", "5"], ["--kubernetes-job"]):
-        assert main([*words, *wrong]) == 2
+    assert "--of 2 --workers 1\n" in capsys.readouterr().out
+    wrong = (["--slurm-script", "--of", "5"], ["--kubernetes-job"], ["--image", "x"], ["--index", "0", "--of", "0"])
+    for options in wrong:
+        assert main([*words, *options]) in (1, 2)
         assert capsys.readouterr().err.count("\n") == 1
+    assert main([*words[:2], words[1], "--slurm-script"]) == 1
+    assert "is a file, and no folder for runs" in capsys.readouterr().err
     assert main([*words, "--kubernetes-job", "--image", "registry/neuralq:1", "--claim", "mine"]) == 0
     job = yaml.safe_load(capsys.readouterr().out)
     assert job["spec"]["completions"] == 4

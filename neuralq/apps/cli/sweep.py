@@ -32,6 +32,8 @@ def sweep(argv: list[str]) -> int:
         raise Failure(f"a file and a folder, two words at most, got {' '.join(options.what)}", 2)
     if options.of is not None and options.index is None and not (options.slurm_script or options.kubernetes_job):
         raise Failure("--of says how many shares there are; add --index, which one to make", 2)
+    if options.image is not None and not options.kubernetes_job:
+        raise Failure("--image is for --kubernetes-job; add that, or leave it out", 2)
     found = _asked_for(file[0], folder, options) if file else _there(folder)
     if options.status:
         return _status(found, options.json)
@@ -70,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         "--kubernetes-job", action="store_true",
         help="print an Indexed Job for kubectl create, a pod for each share; make no run",
     )  # fmt: skip
-    parser.add_argument("--image", default="", metavar="NAME", help="container image for --kubernetes-job")
+    parser.add_argument("--image", metavar="NAME", help="container image for --kubernetes-job")
     parser.add_argument(
         "--claim", default="neuralq-sweeps", metavar="NAME",
         help="PersistentVolumeClaim of --kubernetes-job, with DIR at its root (default: neuralq-sweeps)",
@@ -145,12 +147,13 @@ def _widths(value: Any) -> Any:
 def _script(found: Sweep, options: argparse.Namespace) -> str:
     """What a scheduler is to be given; its shares are as many as are asked for, or as there are runs."""
     config = found.configuration(next(found.members()))
-    threads, gpus = int(config.get("threads", 1)), int(str(config.get("device", "cpu")).startswith("cuda"))
+    threads = max(int(config.get("threads", 1)), *(found.axes or {}).get("threads", [1]))
+    gpus = int(str(config.get("device", "cpu")).startswith("cuda"))
     try:
         shares = num_shares(len(found), options.of)
         if options.slurm_script:
             return slurm_script(found.path, shares, threads, gpus)
-        return kubernetes_job(found.path, shares, options.image, options.claim, threads, gpus)
+        return kubernetes_job(found.path, shares, options.image or "", options.claim, threads, gpus)
     except ValueError as error:
         raise Failure(str(error), 2) from error
 

@@ -26,10 +26,12 @@ from neuralq.runs.hooks import own_hook
 from neuralq.runs.kinds import kind_in, kind_named
 from neuralq.runs.play_off import told_of
 from neuralq.runs.recipe.config import config_from_dict, config_to_dict
+from neuralq.runs.report.page import format_value
 from neuralq.runs.sweep import (
     Engine,
     LocalProcesses,
     Member,
+    RunResult,
     Status,
     Sweep,
     SweepResult,
@@ -41,7 +43,7 @@ from neuralq.runs.sweep import (
 )
 from neuralq.runs.sweep.ray_cluster import RayCluster
 from neuralq.runs.sweep.scripts import REQUEUE
-from neuralq.runs.sweep.statistics import interquartile_mean
+from neuralq.runs.sweep.statistics import Estimate, interquartile_mean
 from neuralq.runs.trust import refuse_strangers
 
 __all__ = [
@@ -59,8 +61,8 @@ __all__ = [
     "train_seeds",
 ]
 
-_MOST_LINES = 200
-"""Of runs, of which each is told at the end."""
+_MOST_LINES = 50
+"""Of runs, and of combinations of values, that are told at the end."""
 _MOST_ROWS = 12
 """Of combinations of values, in the table that is drawn while a sweep runs."""
 
@@ -171,7 +173,8 @@ def refuse_other_kinds(path: str | Path) -> None:
 
 def make_runs(sweep: Sweep, options: argparse.Namespace) -> int:
     """What ``neuralq sweep`` was asked for beside telling how far a sweep is: its runs, or a share of them."""
-    members = None if options.index is None else share_of(sweep, options.index, options.of or len(sweep))
+    of = len(sweep) if options.of is None else options.of
+    members = None if options.index is None else share_of(sweep, options.index, of)
     again = options.retry_failed
     status = run_to_the_end(sweep, engine_of(sweep, options), options.json, members=members, retry_failed=again)
     return REQUEUE if members is not None and status > 128 else status
@@ -241,25 +244,47 @@ def _things(sweep: Sweep) -> str:
 
 
 def _lines(sweep: Sweep, result: SweepResult) -> list[str]:
-    lines = []
-    for run in result.runs if len(result.runs) <= _MOST_LINES else ():
-        name = run.run_dir.relative_to(sweep.path).as_posix().replace("seed-", "seed ")
-        if run.state == "finished":
-            seconds = run.summary.get("cpu_seconds") or 0.0
-            spent = f"{run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds"
-            lines.append(f"{name}: {told_of(run.summary)}, {spent}")
-        else:
-            log = f" (see {run.run_dir}.log)" if run.reason else ""
-            lines.append(f"{name}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}")
-    found = result.estimate
-    if found is not None:
-        text = f"greedy return, interquartile mean over {found.num_runs} seeds: {shown(found.iqm, 2)}"
-        if found.low is not None and found.high is not None:
-            text += f", 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)} (stratified bootstrap)"
-        lines.append(text)
-    if sweep.axes:
-        lines.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes)).rstrip('_')}")
-    return [*lines, f"sweep folder {sweep.path}"]
+    runs = result.runs if sweep.axes is None else [run for run in result.runs if run.state != "finished"]
+    lines = [_line(sweep, run) for run in runs[:_MOST_LINES]]
+    if len(runs) > _MOST_LINES:
+        lines.append(f"and {len(runs) - _MOST_LINES:,} more (neuralq sweep {sweep.path} --status --json has them all)")
+    if sweep.axes is None:
+        found = result.estimate
+        how = "" if found is None or found.low is None else " (stratified bootstrap)"
+        told = [] if found is None else [f"greedy return, interquartile mean over {_counted(found)}{how}"]
+    else:
+        told = _combinations(result)
+        if sweep.axes:
+            told.append(f"side by side: neuralq compare {sweep.path} --by {next(iter(sweep.axes)).rstrip('_')}")
+    return [*lines, *told, f"sweep folder {sweep.path}"]
+
+
+def _line(sweep: Sweep, run: RunResult) -> str:
+    name = run.run_dir.relative_to(sweep.path).as_posix().replace("seed-", "seed ")
+    if run.state != "finished":
+        log = f" (see {run.run_dir}.log)" if run.reason else ""
+        return f"{name}: {run.state}{': ' * bool(run.reason)}{run.reason}{log}"
+    seconds = run.summary.get("cpu_seconds") or 0.0
+    return f"{name}: {told_of(run.summary)}, {run.summary['env_steps']:,} steps, {seconds:.1f} CPU-seconds"
+
+
+def _combinations(result: SweepResult) -> list[str]:
+    """What each combination of values came to, the best first."""
+    found: dict[str, list[RunResult]] = {}
+    for run in result.runs:
+        words = ", ".join(f"{name.rstrip('_')} {format_value(value)}" for name, value in run.options.items()) or "all"
+        found.setdefault(words, []).append(run)
+    estimates = {words: SweepResult(tuple(runs)).estimate for words, runs in found.items()}
+    ordered = sorted((e.iqm, words, _counted(e)) for words, e in estimates.items() if e is not None)[::-1]
+    lines = [f"{words}: interquartile mean over {counted}" for _, words, counted in ordered[:_MOST_LINES]]
+    return [*lines, *([f"and {len(ordered) - _MOST_LINES:,} more combinations"] if len(ordered) > _MOST_LINES else [])]
+
+
+def _counted(found: Estimate) -> str:
+    text = f"{found.num_runs} seed{'s' * (found.num_runs > 1)}: {shown(found.iqm, 2)}"
+    if found.low is None or found.high is None:
+        return text
+    return f"{text}, 95 % interval {shown(found.low, 2)} to {shown(found.high, 2)}"
 
 
 def sweep_bar(
@@ -296,12 +321,15 @@ def sweep_bar(
             named = ", ".join(name.removeprefix("seed-") for name in status.failed[:_MOST_ROWS])
             parts.append(f"failed: {named if sweep.axes is None else len(status.failed)}")
         parts.append(f"{status.env_steps:,} of {status.total_steps:,} steps")
+        left = ""
         if seconds > 0:
             parts.append(f"{steps / seconds:,.0f} steps/s")
+            ahead = (status.total_steps - status.env_steps) * seconds / max(steps, 1)
+            left = f"{ahead / 60:,.0f} min left" if ahead >= 90 else f"{ahead:.0f} s left"
         if status.returns and sweep.axes is None:
             parts.append(f"IQM {shown(float(interquartile_mean(list(status.returns.values()))))}")
         ended = status.num_finished + len(status.failed)
-        return Told(status.env_steps, parts, event=ended, total=status.total_steps)
+        return Told(status.env_steps, parts, left if steps else "", event=ended, total=status.total_steps)
 
     return ProgressBar(1, tell, stream, clock, _cells if sweep.axes else None)
 

@@ -122,7 +122,8 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
     },
     # Stream Q(λ) as published for classic control (Elsayed, Vasan & Mahmood 2024): α = 1, κ = 2, λ = 0.8, γ = 0.99,
     # ε from 1 to 0.01 over 5 % of 500,000 steps, 32-32 units normalised without a scale of their own, nine weights in
-    # ten at 0. The cut is the exact one; --streaming.cut published gives theirs.
+    # ten at 0. The cut is the exact one; --streaming.cut published gives theirs. Their observations hold the elapsed
+    # time of the episode, which ours do not.
     **{
         (env, "streaming"): {
             "total_steps": 500_000,
@@ -141,7 +142,9 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         }
         for env in ("CartPole-v1", "Acrobot-v1", "MountainCar-v0")
     },
-    # PQN (Gallici et al., 2024) on MinAtar; published over 10,000,000 steps, ε over the first tenth of them as here.
+    # PQN's settings on MinAtar (Gallici et al., 2024), published over 10,000,000 steps, ε over the first tenth of them
+    # as here. Our layer norm after the convolution is over all its outputs (134,483 parameters), theirs over channels
+    # (132,467).
     **{
         (f"MinAtar/{game}-v1", "rollout"): {
             **_MINATAR,

@@ -169,6 +169,8 @@ def _seeds_of(value: Any) -> tuple[int, ...]:
         value = _range_of("seeds", value)
     if isinstance(value, int) and not isinstance(value, bool):
         check_whole("seeds", value)
+        if value > _MOST_RUNS:
+            raise ValueError(f"a sweep has at most {_MOST_RUNS:,} runs, got {value:,} seeds; take fewer")
         value = list(range(value))
     check_seeds(value)
     return tuple(value)

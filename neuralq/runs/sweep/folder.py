@@ -187,6 +187,8 @@ def _check_cells(sweep: Sweep) -> None:
 def _write_new(sweep: Sweep) -> None:
     if is_run_folder(sweep.path):
         raise RunFolderError(f"{sweep.path} already holds a run; choose another folder")
+    if sweep.path.exists() and not sweep.path.is_dir():
+        raise RunFolderError(f"{sweep.path} is a file, and no folder for runs; choose another one")
     sweep.path.mkdir(parents=True, exist_ok=True)
     write_durably(sweep.path / "config.json", to_json(sweep.config, "config"))
     _write_marker(sweep)  # last: it marks a sweep

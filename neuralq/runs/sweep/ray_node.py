@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import secrets
 import shutil
 import signal
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import wait
@@ -49,6 +51,7 @@ def attempt(
         options: what else was asked for, as words of the command line.
         shelf: the `Shelf` where no folder is shared; None where one is.
     """
+    _end_with_the_node()
     request = StopRequest()
     with request.listening((signal.SIGINT,)):  # which is what `ray.cancel` comes to in a worker
         try:
@@ -63,6 +66,22 @@ def attempt(
             return _in_a_shared_folder(task, request)
         except (OSError, RunFolderError) as error:
             return f"{last_line(error)} (on node {socket.gethostname()})"
+
+
+@functools.cache
+def _end_with_the_node() -> None:
+    """From now on this process ends as soon as the one that Ray began it from is gone, and with it its run.
+
+    Ray itself leaves workers behind where a node was silent, was taken for dead, and found that out.
+    """
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def last_line(error: BaseException) -> str:
@@ -161,6 +180,7 @@ class Shelf:
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
+        _end_with_the_node()
 
     def begin(self, name: str, total_steps: int) -> tuple[int, bytes | None] | None:
         """The number of a new attempt and what it begins from; None where the run is finished."""

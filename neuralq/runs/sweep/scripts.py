@@ -1,7 +1,8 @@
 """What to hand to somebody else's scheduler: a batch script for Slurm, a Job for Kubernetes.
 
 Both run ``neuralq sweep DIR --index I --of N`` for every share I and leave queueing, limits and what happens to a lost
-node to the scheduler. Nothing but the run folders is state, so handing the file in again is the whole of recovery.
+node to the scheduler. A share has one run at a time, since a node has more cores than a task may use. Nothing but the
+run folders is state, so handing the file in again is the whole of recovery.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ status=$?
 
 # Killed by USR1 itself: asked before it could listen, and nothing lost.
 if [ "$status" = "$work_is_left" ] || { [ -n "$asked" ] && [ "$status" = $((128 + $(kill -l USR1))) ]; }; then
-  if [ "$SECONDS" -lt 60 ] && [ "${SLURM_RESTART_COUNT:-0}" -ge 3 ]; then
+  if [ "$SECONDS" -lt 30 ] && [ "${SLURM_RESTART_COUNT:-0}" -ge 3 ]; then
     echo "its time is up before it gets to work: not queued again; give sbatch a longer --time" >&2
   elif ! scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; then
     echo "could not be queued again: what is left is done by handing this script to sbatch once more" >&2
@@ -73,9 +74,9 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
     finished. A node that is lost, and a task that is preempted, are Slurm's to replace (``--requeue``). What the site
     wants beside it (``--time``, ``--partition``, ``--mem``) goes to ``sbatch``.
 
-    A task that is asked to end within a minute of its beginning queues again three times, not for ever. A task is named
-    by its array and its index: the last task of an array has the number of the whole array, so that its number alone
-    would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
+    A task that is asked to end within half a minute of its beginning queues again three times, not for ever. A task is
+    named by its array and its index: the last task of an array has the number of the whole array, so that its number
+    alone would requeue all of them (github.com/Lightning-AI/pytorch-lightning/issues/15022).
 
     Args:
         path: of the sweep, where the nodes see it too.
@@ -119,7 +120,7 @@ def slurm_script(path: str | Path, shares: int, num_threads: int = 1, num_gpus: 
 export OMP_NUM_THREADS={num_threads}
 work_is_left={REQUEUE}
 share_of_the_runs() {{
-  exec {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares}
+  exec {shlex.join(words)} --index "$SLURM_ARRAY_TASK_ID" --of {shares} --workers 1
 }}
 {_WATCHED}"""
 
@@ -147,7 +148,7 @@ def kubernetes_job(
     Example:
         >>> job = yaml.safe_load(kubernetes_job("runs/lr", 24, "registry/neuralq:1"))
         >>> job["spec"]["completions"], job["spec"]["template"]["spec"]["containers"][0]["args"]
-        (24, ['sweep', '/sweeps/lr', '--index', '$(JOB_COMPLETION_INDEX)', '--of', '24'])
+        (24, ['sweep', '/sweeps/lr', '--index', '$(JOB_COMPLETION_INDEX)', '--of', '24', '--workers', '1'])
     """
     if not image.strip():
         raise ValueError(
@@ -160,7 +161,7 @@ def kubernetes_job(
         "name": "share",
         "image": image,
         "command": ["neuralq"],
-        "args": ["sweep", folder, "--index", "$(JOB_COMPLETION_INDEX)", "--of", str(shares)],
+        "args": ["sweep", folder, "--index", "$(JOB_COMPLETION_INDEX)", "--of", str(shares), "--workers", "1"],
         "env": [{"name": "OMP_NUM_THREADS", "value": str(num_threads)}],
         "resources": {"requests": {"cpu": str(num_threads), **limits}, "limits": limits},
         "volumeMounts": [{"name": "sweeps", "mountPath": "/sweeps"}],
