@@ -185,7 +185,8 @@ def _conclude(study: Study, why: str, options: argparse.Namespace) -> int:
         lines.append(f"confirm with: {_again(study)} --trials {len(study.trials)}")
     print_result(_plain(study, found, why, preset, report), options.json, [*lines, f"report {report}"])
     if interrupted:
-        say(f"{why}: go on with: {_again(study)}")
+        most = "" if options.trials is None else f" --trials {options.trials}"
+        say(f"{why}: go on with: {_again(study)}{most}")
         return 128 + signal.Signals[why].value
     return 0
 
