@@ -331,6 +331,7 @@ def test_a_study_finds_what_is_better_and_confirms_it_on_seeds_that_it_had_not_s
     assert best.flattery == pytest.approx(float(scipy.stats.trim_mean(own, 0.2)) - best.fresh.iqm)  # one of five
     preset = [sharp({**study.trials[0].config, "seed": seed}) for seed in study.fresh_seeds]
     assert best.gain is not None and best.gain.value == pytest.approx(float(np.mean(np.subtract(scores, preset))))
+    assert best.gain == difference(scores, preset, 1 - 0.05 / 3), "three are compared with it"
     assert importances(study)["learning_rate"] > 0.5 > importances(study)["lambda"]
 
 
