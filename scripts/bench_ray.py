@@ -70,6 +70,7 @@ def main() -> None:
     options = parser.parse_args()
     os.environ["NEURALQ_BENCH_RAY"] = f"{os.getpid()}-{time.time()}"
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    import ray
     from ray.cluster_utils import Cluster
 
     cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
@@ -103,6 +104,7 @@ def main() -> None:
         print(f"{finished} of {options.runs} runs finished, {finished / seconds:.1f} a second on two cores")
         cluster.connect()
         print(f"Ray alone: {empty_tasks(5000):,.0f} tasks a second")
+        ray.shutdown()
     finally:
         cluster.shutdown()
 

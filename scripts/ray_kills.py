@@ -3,9 +3,9 @@
 A sweep of short CartPole runs is made by the command ``neuralq sweep --ray`` on a cluster of two nodes of this machine.
 Every few seconds a worker of Ray's, a node (its raylet; another is added) or the command (which is begun again) is
 killed by SIGKILL, while a run goes on. A node may also be frozen: it is taken for dead and its run begun elsewhere,
-while its worker still writes. Another sweep is begun until there were enough rounds. Each run has to be finished, once
-(but where a node was frozen), with the bits that local processes give, and no process may be left. The exit status is
-0 only then.
+while its worker still writes. With --storage none the process beside the command may be killed. Another sweep is begun
+until there were enough rounds. Each run has to be finished, once (but where a node was frozen), with the bits that
+local processes give, and no process may be left. The exit status is 0 only then.
 
     python scripts/ray_kills.py --what worker --rounds 20
     python scripts/ray_kills.py --what node --rounds 20 --storage none
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import signal
@@ -86,6 +87,13 @@ def workers_at_runs() -> list[int]:
     return [worker for pid in forked if (worker := parent_of(pid)) in alive]
 
 
+def num_begun() -> int:
+    """How often runs have begun or gone on, by what they write down."""
+    journal = Path(os.environ[TOKEN])
+    lines = journal.read_text().splitlines() if journal.exists() else []
+    return sum(line.startswith(("zero", "resumed")) for line in lines)
+
+
 class Trial:
     """A cluster, and the sweeps that are made on it."""
 
@@ -109,11 +117,16 @@ class Trial:
 
     def sweep(self, folder: Path, expected: dict[int, str]) -> None:
         """One sweep to its end, with kills while there are rounds left."""
-        command = self.start(folder)
-        due = time.monotonic() + self.random.uniform(2, 5)
+        command, begun, due = self.start(folder), 0, math.inf
         while command.poll() is None:
             time.sleep(0.05)
-            if self.rounds < self.options.rounds and time.monotonic() > due and workers_at_runs():
+            if self.rounds == self.options.rounds:
+                continue
+            if due == math.inf and num_begun() > begun:  # since the last kill a run has begun, or gone on
+                due = time.monotonic() + self.random.uniform(0, 4)
+            if time.monotonic() > due and workers_at_runs():
+                begun, due = num_begun(), math.inf
+                self.rounds += 1
                 if self.options.what == "coordinator":
                     command.kill()
                     command.wait()
@@ -121,8 +134,6 @@ class Trial:
                     command = self.start(folder)
                 else:
                     self.kill()
-                self.rounds += 1
-                due = time.monotonic() + self.random.uniform(1, 4)
         self.await_silence("the sweep ended")
         if command.returncode:
             said = folder.with_suffix(".out").read_text(errors="replace").splitlines()[-3:]
@@ -132,6 +143,11 @@ class Trial:
     def kill(self) -> None:
         if self.options.what == "worker":
             os.kill(self.random.choice(workers_at_runs()), signal.SIGKILL)
+            return
+        if self.options.what == "shelf":
+            for pid, line in ours().items():
+                if line.startswith("ray::Shelf"):
+                    os.kill(pid, signal.SIGKILL)
             return
         node = self.nodes.pop(self.random.randrange(2))
         self.cluster.worker_nodes.discard(node)
@@ -186,7 +202,7 @@ def expected_bits(root: Path) -> dict[int, str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--what", choices=("worker", "node", "coordinator", "frozen"), default="worker")
+    parser.add_argument("--what", choices=("worker", "node", "coordinator", "frozen", "shelf"), default="worker")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--storage", choices=("shared", "none"), default="shared")
     parser.add_argument("--runs", type=int, default=8, help="of each sweep")

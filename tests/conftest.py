@@ -114,7 +114,7 @@ WHOLE = (
     *("test_figure_13_2", "test_hierarchies", "test_job_shop", "test_lin", "test_mccallum", "test_obelix"),
     *("test_thrun_robot_learning",),
     *("test_checkpoint_kill", "test_children", "test_processes_of_others", "test_signals"),
-    *("test_sweep_attempts",),
+    *("test_processors", "test_sweep", "test_sweep_attempts", "test_sweep_scripts", "test_tune"),
     *("test_cli_export", "test_docs", "test_export_torch", "test_lab_registry", "test_modules", "test_registry"),
     *("test_figures", "test_play", "test_play_checkers", "test_play_page", "test_play_turns", "test_report"),
     *("test_scripts", "test_turned", "test_web", "test_web_page"),

@@ -22,7 +22,7 @@ import pytest
 import neuralq
 from neuralq.apps.cli import main
 from neuralq.runs.folder.run_folder import read_summary
-from neuralq.runs.sweep import Asked, Sweep, ask, run_sweep
+from neuralq.runs.sweep import Asked, Engine, LocalProcesses, Sweep, ask, run_sweep
 from neuralq.runs.sweep.ray_cluster import RayCluster
 from neuralq.runs.sweep.states import saved_steps, state_of
 
@@ -131,6 +131,24 @@ def test_what_is_no_cluster_is_said_at_once(tmp_path: Path) -> None:
         RayCluster("auto", tmp_path, storage="s3")
     with pytest.raises(ValueError, match="gpus must be a finite number"):
         RayCluster("auto", tmp_path, num_gpus=-1)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_24_runs_end_with_the_same_bits_here_and_on_two_nodes(tmp_path: Path, cluster: Any) -> None:
+    asked = Asked({"env": "CartPole-v1", "total_steps": 5000}, {"learning_rate": [3e-4, 1e-3, 3e-3]}, tuple(range(8)))
+    second, found = cluster.add_node(num_cpus=1), list[list[str]]()
+    try:
+        for kind in ("local", "shared", "none"):
+            sweep = ask(tmp_path / kind, asked)
+            config = sweep.configuration(next(sweep.members()))
+            engine: Engine = LocalProcesses(2, config)
+            if kind != "local":
+                engine = RayCluster(cluster.address, sweep.path, storage=kind)
+            found.append([run.summary["parameters_sha256"] for run in run_sweep(sweep, engine).runs])
+    finally:
+        cluster.remove_node(second)
+    assert found[0] == found[1] == found[2] and len(set(found[0])) == 24
 
 
 @pytest.mark.slow

@@ -177,15 +177,20 @@ def _conclude(study: Study, why: str, options: argparse.Namespace) -> int:
     report = write_tune_report(study)
     lines = [f"{len(study.trials)} trials; {'interrupted' if interrupted else why}", verdict(study)]
     if best is not None:
-        flattered = f"the race had it at {shown(best.searched.iqm)}, {shown(best.flattery)} above"
-        lines += [flattered, f"train with it: neuralq train {study.start.plain['env']} --config {preset}"]
+        ahead = max(found, key=lambda one: one.searched.iqm)
+        name = f"trial {ahead.trial.number}" if ahead.trial.number else "the preset"
+        lines.append(
+            f"the race had {name} ahead with {shown(ahead.searched.iqm)}: flattered by {shown(ahead.flattery)}"
+        )
+        lines += [f"train with it: neuralq train {study.start.plain['env']} --config {preset}"]
     missing = {trial.number for trial in candidates(study)} - {one.trial.number for one in found}
     if missing and not interrupted:
         lines.append(f"not confirmed for want of time: trial{'s' * (len(missing) > 1)} {_joined(missing)}")
         lines.append(f"confirm with: {_again(study)} --trials {len(study.trials)}")
     print_result(_plain(study, found, why, preset, report), options.json, [*lines, f"report {report}"])
     if interrupted:
-        say(f"{why}: go on with: {_again(study)}")
+        most = "" if options.trials is None else f" --trials {options.trials}"
+        say(f"{why}: go on with: {_again(study)}{most}")
         return 128 + signal.Signals[why].value
     return 0
 

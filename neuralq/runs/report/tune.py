@@ -123,8 +123,9 @@ def _tiles(study: Study, found: Sequence[Confirmed]) -> list[tuple[str, str, str
     entries = [("result", short_number(best.fresh.iqm), remark)]
     if best.trial.number:
         entries.append(("preset", short_number(preset.fresh.iqm), f"on the same seeds{_interval(preset.fresh)}"))
-    told = f"the race had {_named(best.trial)} at {short_number(best.searched.iqm)}"
-    return [*entries, ("flattered by the race", short_number(best.flattery), told), spent]
+    first = max(found, key=lambda one: one.searched.iqm)
+    told = f"its best, {_named(first.trial)}, had {short_number(first.searched.iqm)}{_interval(first.searched)}"
+    return [*entries, ("flattered by the race", short_number(first.flattery), told), spent]
 
 
 def _warnings(study: Study, found: Sequence[Confirmed]) -> list[str]:

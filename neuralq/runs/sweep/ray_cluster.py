@@ -24,6 +24,7 @@ from neuralq.runs.sweep.task import Task
 __all__ = ["RayCluster", "require_ray"]
 
 _LEAST_AT_A_TIME = 8
+_MARKS = ("sweep.json", "study.json")
 _COUNTED_SECONDS = 10.0
 """Between looks at how large the cluster is."""
 _CONNECT_SECONDS = 5.0
@@ -55,7 +56,7 @@ class RayCluster:
 
     Args:
         address: of the head, "host:port", or "auto" for the cluster that this machine belongs to.
-        sweep: the folder of the sweep.
+        folder: of all the runs: a sweep's or a study's.
         num_cpus: that a run takes of a node.
         num_gpus: likewise; a part of one is allowed.
         storage: "shared" where every node sees the folder by its name; "none" where runs are to be sent home.
@@ -67,14 +68,15 @@ class RayCluster:
     """
 
     def __init__(
-        self, address: str, sweep: Path, num_cpus: float = 1.0, num_gpus: float = 0.0, storage: str = "shared"
+        self, address: str, folder: Path, num_cpus: float = 1.0, num_gpus: float = 0.0, storage: str = "shared"
     ) -> None:
         check_choice("storage", storage, ("shared", "none"))
         for name, value in (("cpus", num_cpus), ("gpus", num_gpus)):
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
         self._ray = require_ray()
-        self._sweep = os.path.abspath(sweep)
+        self._folder = os.path.abspath(folder)
+        self._mark = next((name for name in _MARKS if Path(folder, name).exists()), "")
         self._asks = {"CPU": num_cpus, "GPU": num_gpus}
         self._running: dict[Any, Task] = {}
         self.address = _connect(self._ray, address)
@@ -95,7 +97,7 @@ class RayCluster:
 
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=False)
         options = {"num_cpus": 0, "max_restarts": -1, "max_task_retries": -1, "scheduling_strategy": here}
-        return self._ray.remote(**options)(Shelf).remote(self._sweep)
+        return self._ray.remote(**options)(Shelf).remote(self._folder)
 
     @property
     def title(self) -> str:
@@ -117,8 +119,8 @@ class RayCluster:
 
     def start(self, task: Task) -> None:
         """Give Ray a task."""
-        name = os.path.relpath(os.path.abspath(task.path), self._sweep)
-        reference = self._attempt.remote(self._sweep, name, task.config, task.options, self._shelf)
+        name = os.path.relpath(os.path.abspath(task.path), self._folder)
+        reference = self._attempt.remote(self._folder, self._mark, name, task.config, task.options, self._shelf)
         self._running[reference] = task
 
     def collect(self, seconds: float) -> list[Ended]:

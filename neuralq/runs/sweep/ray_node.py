@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import secrets
 import shutil
 import signal
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import wait
@@ -36,25 +38,50 @@ _SENDING = 10
 """After a parcel nothing is sent for so many times as long as it took: a run is not held up by being saved."""
 
 
-def attempt(sweep: str, name: str, config: Mapping[str, Any], options: tuple[str, ...], shelf: Any = None) -> str:
+def attempt(
+    folder: str, mark: str, name: str, config: Mapping[str, Any], options: tuple[str, ...], shelf: Any = None
+) -> str:
     """One attempt at a run, until it has ended or is asked to; why it did not come to that, "" where it did.
 
     Args:
-        sweep: the folder of the sweep, as the nodes see it; without a meaning where there is a shelf.
+        folder: of all the runs, as the nodes see it; without a meaning where there is a shelf.
+        mark: of a file in it, which says that it is the same folder.
         name: of the run within it.
         config: of the run, whole.
         options: what else was asked for, as words of the command line.
         shelf: the `Shelf` where no folder is shared; None where one is.
     """
+    _end_with_the_node()
     request = StopRequest()
     with request.listening((signal.SIGINT,)):  # which is what `ray.cancel` comes to in a worker
         try:
-            task = Task(name, Path(sweep, name), dict(config), options)
+            task = Task(name, Path(folder, name), dict(config), options)
             if shelf is not None:
                 return _beside_a_shelf(task, shelf, request)
-            return _in_a_shared_folder(task, Path(sweep), request)
+            if not Path(folder, mark).exists():
+                return (
+                    f"node {socket.gethostname()} does not see {folder}: name a folder that every node sees by that "
+                    "name, or take --storage none, which sends runs home"
+                )
+            return _in_a_shared_folder(task, request)
         except (OSError, RunFolderError) as error:
             return f"{last_line(error)} (on node {socket.gethostname()})"
+
+
+@functools.cache
+def _end_with_the_node() -> None:
+    """From now on this process ends as soon as the one that Ray began it from is gone, and with it its run.
+
+    Ray itself leaves workers behind where a node was silent, was taken for dead, and found that out.
+    """
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def last_line(error: BaseException) -> str:
@@ -68,12 +95,7 @@ def last_line(error: BaseException) -> str:
     return lines[-1] if lines else type(error).__name__
 
 
-def _in_a_shared_folder(task: Task, sweep: Path, request: StopRequest) -> str:
-    if not (sweep / "sweep.json").is_file():
-        return (
-            f"node {socket.gethostname()} does not see {sweep}: name a folder that every node sees by that name, or "
-            "take --storage none, which sends runs home"
-        )
+def _in_a_shared_folder(task: Task, request: StopRequest) -> str:
     total_steps = int(task.config["total_steps"])
     path = begin(task.path, total_steps)
     if path is None:
@@ -148,25 +170,26 @@ class _Sender:
 
 
 class Shelf:
-    """An actor on the machine of the command: keeps what attempts send it in the folder of the sweep.
+    """An actor on the machine of the command: keeps what attempts send it in the folder of all the runs.
 
     Everything that it knows is in that folder, so that it can be killed and begun again.
 
     Args:
-        sweep: the folder.
+        folder: which.
     """
 
-    def __init__(self, sweep: str) -> None:
-        self.sweep = Path(sweep)
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        _end_with_the_node()
 
     def begin(self, name: str, total_steps: int) -> tuple[int, bytes | None] | None:
         """The number of a new attempt and what it begins from; None where the run is finished."""
-        path = begin(self.sweep / name, total_steps)
+        path = begin(self.folder / name, total_steps)
         return None if path is None else (int(path.name), pack(path) if saved_steps(path) else None)
 
     def keep(self, name: str, number: int, parcel: bytes) -> None:
         """Puts what an attempt has come to in its folder, unless that was given up."""
-        own = attempts_path(self.sweep / name) / str(number)
+        own = attempts_path(self.folder / name) / str(number)
         if not own.is_dir():
             return
         place = own.with_name(f".tmp-{number}-{secrets.token_hex(8)}")
@@ -184,7 +207,7 @@ class Shelf:
 
     def end(self, name: str, number: int, parcel: bytes | None, total_steps: int) -> None:
         """An attempt has ended: it becomes the run."""
-        path = self.sweep / name
+        path = self.folder / name
         if parcel is not None:
             self.keep(name, number, parcel)
         own = attempts_path(path) / str(number)
