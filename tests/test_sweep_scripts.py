@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -36,7 +37,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def perform(place: Path, job: str, told: bool = False, restarts: int = 0, seconds: int = 0) -> tuple[int, str]:
+def perform(place: Path, job: str, told: int = 0, restarts: int = 0, seconds: int = 0) -> tuple[int, str]:
     """The script's exit status and what it asked of ``scontrol``, where the command does ``job``."""
     root = place.parent
     (root / "job").write_text(job)
@@ -44,7 +45,7 @@ def perform(place: Path, job: str, told: bool = False, restarts: int = 0, second
     env = {**os.environ, "PATH": f"{root}:{os.environ['PATH']}", "SLURM_ARRAY_JOB_ID": "12", "SLURM_ARRAY_TASK_ID": "3"}
     env |= {"SLURM_JOB_ID": "12", "SLURM_RESTART_COUNT": str(restarts), "SECONDS": str(seconds)}
     with subprocess.Popen(["bash", str(root / "script")], env=env, stdout=subprocess.PIPE) as process:
-        if told:
+        for _ in range(told):
             assert process.stdout is not None and process.stdout.readline() == b"ready\n"
             process.send_signal(signal.SIGUSR1)
         status = process.wait(20)
@@ -55,22 +56,26 @@ def perform(place: Path, job: str, told: bool = False, restarts: int = 0, second
 SAVES = "trap 'exit {}' USR1; echo ready; for _ in {{1..2000}}; do sleep .01; done"
 
 
+TWICE = "n=0; trap 'n=$((n + 1)); echo ready; [ $n = 2 ] && exit 75' USR1; " + SAVES.partition("; ")[2]
+
+
 @pytest.mark.parametrize(
     ("job", "told", "status", "asked"),
     [
-        ("exit 0", False, 0, ""),
-        ("exit 1", False, 1, ""),
-        ("exit 75", False, 75, "requeue 12_3\n"),
-        (SAVES.format(75), True, 75, "requeue 12_3\n"),
-        (SAVES.format(0), True, 0, ""),  # finished just then
-        (SAVES.format(1), True, 1, ""),
-        ("echo ready; exec sleep 20", True, 138, "requeue 12_3\n"),  # it did not listen yet
-        ("kill -USR1 $$", False, 138, ""),
-        ("kill -KILL $$", False, 137, ""),
+        ("exit 0", 0, 0, ""),
+        ("exit 1", 0, 1, ""),
+        ("exit 75", 0, 75, "requeue 12_3\n"),
+        (SAVES.format(75), 1, 75, "requeue 12_3\n"),
+        (SAVES.format(0), 1, 0, ""),  # finished just then
+        (SAVES.format(1), 1, 1, ""),
+        ("echo ready; exec sleep 20", 1, 138, "requeue 12_3\n"),  # it did not listen yet
+        (TWICE, 2, 75, "requeue 12_3\n"),
+        ("kill -USR1 $$", 0, 138, ""),
+        ("kill -KILL $$", 0, 137, ""),
     ],
 )
 def test_a_task_queues_again_when_work_is_left_and_only_then(
-    place: Path, job: str, told: bool, status: int, asked: str
+    place: Path, job: str, told: int, status: int, asked: str
 ) -> None:
     assert perform(place, job, told) == (status, asked)
 
@@ -111,7 +116,7 @@ def test_runs_are_dealt_to_as_many_tasks_as_a_site_takes() -> None:
         num_shares(3, 4)
 
 
-def job_of(path: str | Path = "/data/a $(HOSTNAME) sweep") -> dict[str, Any]:
+def job_of(path: str | Path = "/data/a $(OMP_NUM_THREADS) $$weep") -> dict[str, Any]:
     return dict(yaml.safe_load(kubernetes_job(path, 3, "registry/neuralq:1", num_threads=2, num_gpus=1)))
 
 
@@ -132,9 +137,13 @@ def test_a_job_of_kubernetes_tells_what_is_lost_from_what_failed() -> None:
     [container], [volume] = pod["containers"], pod["volumes"]
     assert volume["persistentVolumeClaim"]["claimName"] == "neuralq-sweeps"
     assert container["resources"]["limits"] == {"memory": "2Gi", "nvidia.com/gpu": "1"}
-    # As the kubelet writes it (k8s.io/kubernetes/third_party/forked/golang/expansion): "$(X)" is X, "$$" is "$".
-    words = [word.replace("$(JOB_COMPLETION_INDEX)", "2").replace("$$", "$") for word in container["args"]]
-    assert words == ["sweep", "/sweeps/a $(HOSTNAME) sweep", "--index", "2", "--of", "3", "--workers", "1"]
+    # As the kubelet has it (kubernetes/third_party/forked/golang/expansion): "$(X)" is X where it knows X, "$$" is "$".
+    known = {"JOB_COMPLETION_INDEX": "2", **{pair["name"]: pair["value"] for pair in container["env"]}}
+    words = [
+        re.sub(r"\$\$|\$\((\w+)\)", lambda m: known.get(m[1], m[0]) if m[1] else "$", w) for w in container["args"]
+    ]
+    folder = "/sweeps/a $(OMP_NUM_THREADS) $$weep"
+    assert words == ["sweep", folder, "--index", "2", "--of", "3", "--workers", "1"]
     with pytest.raises(ValueError, match="--image"):
         kubernetes_job("/data", 3, " ")
 
