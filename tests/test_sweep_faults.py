@@ -59,7 +59,7 @@ def small_disk(path: Path, size: str) -> Iterator[None]:
         subprocess.run(["umount", str(path)], check=True)
 
 
-@pytest.mark.whole
+@pytest.mark.slow
 def test_a_full_disk_and_a_missing_package_are_their_runs_own(tmp_path: Path) -> None:
     asked = ask_for(tmp_path, env=["CartPole-v1", "cart_of_mine:Cart-v0"], seeds=2)
     (tmp_path / "package").mkdir()
