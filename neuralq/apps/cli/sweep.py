@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         "neuralq sweep runs/rates --index 3 --of 20",
         "neuralq compare runs/rates --by learning_rate --out rates.svg",
     )
+    parser.usage = "neuralq sweep FILE.yaml DIR [options], or neuralq sweep DIR [options] to go on"
     parser.add_argument("what", nargs="+", metavar="FILE.yaml DIR", help="what is asked for, and where the runs go")
     parser.add_argument("--workers", type=int, metavar="N", help="runs at a time (default: as many as there are cores)")
     add_cluster(parser)
