@@ -21,7 +21,8 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from neuralq.apps.cli import faults, main, terminal
+from neuralq.apps.cli import main, terminal
+from neuralq.runs import faults
 from neuralq.runs.stream import Interaction
 
 NOISY = '''

@@ -290,6 +290,15 @@ def test_each_run_gets_its_options_over_the_preset_of_its_environment(tmp_path: 
     assert not (tmp_path / "other").exists()
 
 
+def test_of_very_many_combinations_each_value_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuralq.runs.sweep.folder._MOST_CHECKED", 3)
+    base, axes = {"env": "CartPole-v1"}, {"gamma": [0.5, 0.9], "lambda_": [0.1, 0.2]}
+    assert len(ask(tmp_path / "sweep", Asked(base, axes, (0,)))) == 4
+    for name in axes:
+        with pytest.raises(ValueError, match=f"with .*{name} 2"):
+            ask(tmp_path / "other", Asked(base, {**axes, name: [*axes[name], 2]}, (0,)))
+
+
 @pytest.mark.parametrize(
     ("value", "values"),
     [

@@ -155,7 +155,7 @@ class _Loop:
         self.attempts: dict[str, tuple[int, int]] = {}
         self.stopping = False
         self._looked = time.monotonic()
-        self._budgets = {member.name: int(sweep.configuration(member)["total_steps"]) for member in members}
+        self._budgets = {m.name: m.total_steps or int(sweep.configuration(m)["total_steps"]) for m in members}
         self._steps: dict[str, int] = {}
         self._returns: dict[str, float] = {}
         self._failed: dict[str, None] = {}

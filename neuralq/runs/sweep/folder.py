@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,6 +20,8 @@ __all__ = ["Member", "Sweep", "ask", "create_sweep", "is_sweep_folder", "open_sw
 
 FORMAT_NAME = "neuralq-sweep"
 FORMAT_VERSION = 2
+_MOST_CHECKED = 1_000
+"""Combinations of values of which each is tried as a configuration when a sweep is asked for: about two seconds."""
 _OF_SEEDS = 1
 """The version of sweeps whose configuration is whole and whose runs differ in their seed alone."""
 
@@ -60,7 +62,6 @@ class Sweep:
     seeds: tuple[int, ...]
     options: tuple[str, ...] = ()
     axes: dict[str, list[Any]] | None = None
-    _cells: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def asked(self) -> Asked:
@@ -89,10 +90,7 @@ class Sweep:
             return {**self.config, "seed": member.seed}
         from neuralq.runs.sweep.resolving import resolved  # brings PyTorch, as in `_check_cells`
 
-        place = member.name.rpartition("/")[0]
-        if place not in self._cells:
-            self._cells[place] = resolved(self.config, member.options, member.seed)
-        return {**self._cells[place], "seed": member.seed}
+        return resolved(self.config, member.options, member.seed)
 
     def task(self, member: Member) -> Task:
         """What a process needs to know to make a run."""
@@ -173,15 +171,24 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
 
 
 def _check_cells(sweep: Sweep) -> None:
-    """Raises ValueError where a combination of values is no configuration: before anything is begun."""
+    """Raises ValueError where a combination of values is no configuration: before anything is begun.
+
+    Of very many only those are looked at that have each value once; of others the runs say so.
+    """
     from neuralq.runs.sweep.resolving import resolved
 
-    for cell in sweep.asked.cells():
+    asked = sweep.asked
+    for cell in asked.cells() if asked.num_cells <= _MOST_CHECKED else _each_value_once(asked):
         try:
             resolved(sweep.config, cell, sweep.seeds[0])
         except ValueError as error:
             where = ", ".join(f"{name} {value!r}" for name, value in cell.items())
             raise ValueError(f"{error}{f' (with {where})' if where else ''}") from error
+
+
+def _each_value_once(asked: Asked) -> Iterator[dict[str, Any]]:
+    first = {name: values[0] for name, values in asked.axes.items()}
+    yield from ({**first, name: value} for name, values in asked.axes.items() for value in values)
 
 
 def _write_new(sweep: Sweep) -> None:
