@@ -242,6 +242,13 @@ def test_a_run_that_another_process_is_at_is_waited_for(tmp_path: Path, monkeypa
     assert engine.asked == [1, 0] and sweep.state(next(sweep.members())).state == "finished"
 
 
+def test_the_table_below_the_bar_has_the_best_combination_first() -> None:
+    returns = {"gamma=0.9-0123abcd/seed-0": 1.0, "gamma=0.5-0123abce/seed-0": 3.0, "gamma=0.9-0123abcd/seed-1": 4.0}
+    table = sweeps._cells(Status(0, 0, (), 3, (), returns))
+    columns = [list(column.cells) for column in table.columns]
+    assert columns == [["3.0", "2.5"], ["1", "2"], ["gamma=0.5", "gamma=0.9"]]
+
+
 def test_shares_divide_a_sweep(tmp_path: Path) -> None:
     sweep = ask(tmp_path / "sweep", ASKED)
     shares = [[member.name for member in share_of(sweep, index, 3)] for index in range(3)]
@@ -266,6 +273,7 @@ def test_values_and_seeds_are_added_and_nothing_is_made_again(tmp_path: Path) ->
     again = Pretender()
     assert len(run_sweep(more, again).runs) == 9 and again.asked == [0, 1, 2, 2, 2]
     assert open_sweep(sweep.path).asked == more.asked
+    assert ask(sweep.path, Asked(ASKED.base, ASKED.axes, (3,))).seeds == open_sweep(sweep.path).seeds == (0, 1, 2, 3)
     for base, axes, named in (
         ({**ASKED.base, "total_steps": 7}, ASKED.axes, "total_steps: 1000 there, 7 here"),
         (ASKED.base, {}, r"gamma: \[0.9, 0.99, 0.95\] there, 'nothing' here"),
@@ -340,6 +348,7 @@ def test_a_list_is_one_value_of_an_option_whose_values_are_lists() -> None:
         ({"gamma": 1, "seeds": [1, 1]}, "each named once"),
         ({"gamma": 1, "seed": 1, "seeds": 2}, "seed and seeds"),
         ({"lambda": 1, "lambda_": 1}, "lambda_ is given twice"),
+        ({"lambda": [1], "lambda_": [2]}, "lambda_ is given twice"),
         ({"a": {"from": 1, "to": 10_000}, "b": {"from": 1, "to": 10_000}}, "at most 10,000,000 runs"),
     ],
 )
