@@ -44,6 +44,7 @@ from neuralq.runs.sweep import (
     state_of,
 )
 from neuralq.runs.sweep import engine as engine_module
+from neuralq.runs.sweep import folder as folder_module
 from neuralq.runs.sweep.scripts import REQUEUE
 from neuralq.runs.sweep.states import forget_failure, note_failure
 
@@ -281,6 +282,24 @@ def test_values_and_seeds_are_added_and_nothing_is_made_again(tmp_path: Path) ->
     ):
         with pytest.raises(RunFolderError, match=named):
             ask(sweep.path, Asked(base, axes, (0,)))
+
+
+def test_what_another_command_asks_for_at_the_same_moment_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep, check = ask(tmp_path / "sweep", ASKED), folder_module._check_cells
+
+    def meanwhile(new: Sweep) -> None:
+        monkeypatch.setattr(folder_module, "_check_cells", check)
+        ask(sweep.path, Asked(ASKED.base, ASKED.axes, (7,)))
+
+    monkeypatch.setattr(folder_module, "_check_cells", meanwhile)
+    assert ask(sweep.path, Asked(ASKED.base, ASKED.axes, (8,))).seeds == (0, 1, 7, 8)
+    lock = FolderLock(sweep.path / "sweep.lock", "busy")
+    assert ask(sweep.path, ASKED).seeds == (0, 1, 7, 8), "nothing is to be written"
+    with pytest.raises(RunFolderBusy, match="is being run by process"):
+        ask(sweep.path, Asked(ASKED.base, ASKED.axes, (9,)))
+    lock.close()
 
 
 def test_each_run_gets_its_options_over_the_preset_of_its_environment(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from neuralq.checks import check_whole
-from neuralq.runs.folder.files import read_json, to_json, write_durably
+from neuralq.runs.folder.files import FolderLock, read_json, to_json, write_durably
 from neuralq.runs.folder.run_folder import RunFolderError, is_run_folder
 from neuralq.runs.sweep.asked import Asked, cell_name, check_seeds
 from neuralq.runs.sweep.states import RunState, state_of
@@ -134,7 +135,9 @@ def create_sweep(
     sweep = Sweep(Path(path), dict(config), tuple(seeds), tuple(options))
     if is_sweep_folder(path):
         raise RunFolderError(f"{path} already holds a sweep; continue it with `neuralq resume {path}`")
-    _write_new(sweep)
+    _refuse_a_run(sweep.path)
+    sweep.path.mkdir(parents=True, exist_ok=True)
+    _write(sweep)
     return sweep
 
 
@@ -144,6 +147,7 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
     Raises:
         ValueError: if what is asked for is no configuration, for one of the combinations of values.
         RunFolderError: if there is a run in ``path``, or a sweep that was asked for otherwise.
+        RunFolderBusy: if something is to be added to a sweep that is being run.
 
     Example:
         >>> import tempfile
@@ -151,11 +155,24 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
         >>> len(ask(path, Asked(base, {"gamma": [0.9]}, (0, 1)))), len(ask(path, Asked(base, {"gamma": [0.99]}, (0,))))
         (2, 4)
     """
-    new = Sweep(Path(path), asked.base, asked.seeds, tuple(options), asked.axes)
+    path = Path(path)
+    sweep, is_known = _joined(path, asked, options)
+    if is_known:
+        return sweep
+    _check_cells(sweep)
+    _refuse_a_run(path)
+    path.mkdir(parents=True, exist_ok=True)
+    with contextlib.closing(FolderLock(path / "sweep.lock", f"the sweep in {path} is being run")):
+        sweep, is_known = _joined(path, asked, options)  # another command may have asked meanwhile
+        if not is_known:
+            _write(sweep)
+    return sweep
+
+
+def _joined(path: Path, asked: Asked, options: Sequence[str]) -> tuple[Sweep, bool]:
+    """The sweep in a folder with what is asked for beside, or a new one; whether it is there as it is."""
     if not is_sweep_folder(path):
-        _check_cells(new)
-        _write_new(new)
-        return new
+        return Sweep(path, asked.base, asked.seeds, tuple(options), asked.axes), False
     old = open_sweep(path)
     if old.axes is None:
         raise RunFolderError(f"{path} is a sweep of seeds that `neuralq train --seeds` made; choose another folder")
@@ -164,10 +181,7 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
     except ValueError as error:
         raise RunFolderError(f"{path} already holds a sweep: {error}") from error
     sweep = Sweep(old.path, old.config, both.seeds, old.options, both.axes)
-    if (both.axes, both.seeds) != (old.axes, old.seeds):
-        _check_cells(sweep)
-        _write_marker(sweep)
-    return sweep
+    return sweep, (both.axes, both.seeds) == (old.axes, old.seeds)
 
 
 def _check_cells(sweep: Sweep) -> None:
@@ -191,17 +205,14 @@ def _each_value_once(asked: Asked) -> Iterator[dict[str, Any]]:
     yield from ({**first, name: value} for name, values in asked.axes.items() for value in values)
 
 
-def _write_new(sweep: Sweep) -> None:
-    if is_run_folder(sweep.path):
-        raise RunFolderError(f"{sweep.path} already holds a run; choose another folder")
-    if sweep.path.exists() and not sweep.path.is_dir():
-        raise RunFolderError(f"{sweep.path} is a file, and no folder for runs; choose another one")
-    sweep.path.mkdir(parents=True, exist_ok=True)
-    write_durably(sweep.path / "config.json", to_json(sweep.config, "config"))
-    _write_marker(sweep)  # last: it marks a sweep
+def _refuse_a_run(path: Path) -> None:
+    if is_run_folder(path):
+        raise RunFolderError(f"{path} already holds a run; choose another folder")
 
 
-def _write_marker(sweep: Sweep) -> None:
+def _write(sweep: Sweep) -> None:
+    if not is_sweep_folder(sweep.path):
+        write_durably(sweep.path / "config.json", to_json(sweep.config, "config"))
     marker: dict[str, Any] = {
         "format": FORMAT_NAME,
         "version": _OF_SEEDS if sweep.axes is None else FORMAT_VERSION,
@@ -210,7 +221,7 @@ def _write_marker(sweep: Sweep) -> None:
     }
     if sweep.axes is not None:
         marker["axes"] = sweep.axes
-    write_durably(sweep.path / "sweep.json", to_json(marker, "sweep", sealed=True))
+    write_durably(sweep.path / "sweep.json", to_json(marker, "sweep", sealed=True))  # last: it marks a sweep
 
 
 def _check_options(options: Any) -> None:
