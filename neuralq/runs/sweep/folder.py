@@ -135,7 +135,7 @@ def create_sweep(
     sweep = Sweep(Path(path), dict(config), tuple(seeds), tuple(options))
     if is_sweep_folder(path):
         raise RunFolderError(f"{path} already holds a sweep; continue it with `neuralq resume {path}`")
-    _refuse_a_run(sweep.path)
+    _refuse_others(sweep.path)
     sweep.path.mkdir(parents=True, exist_ok=True)
     _write(sweep)
     return sweep
@@ -160,7 +160,7 @@ def ask(path: str | Path, asked: Asked, options: Sequence[str] = ()) -> Sweep:
     if is_known:
         return sweep
     _check_cells(sweep)
-    _refuse_a_run(path)
+    _refuse_others(path)
     path.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(FolderLock(path / "sweep.lock", f"the sweep in {path} is being run")):
         sweep, is_known = _joined(path, asked, options)  # another command may have asked meanwhile
@@ -205,9 +205,11 @@ def _each_value_once(asked: Asked) -> Iterator[dict[str, Any]]:
     yield from ({**first, name: value} for name, values in asked.axes.items() for value in values)
 
 
-def _refuse_a_run(path: Path) -> None:
+def _refuse_others(path: Path) -> None:
     if is_run_folder(path):
         raise RunFolderError(f"{path} already holds a run; choose another folder")
+    if path.exists() and not path.is_dir():
+        raise RunFolderError(f"{path} is a file, and no folder for runs; choose another one")
 
 
 def _write(sweep: Sweep) -> None:
