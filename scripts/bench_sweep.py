@@ -16,6 +16,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,6 @@ def timed(work: Callable[[], Any]) -> tuple[float, float]:
 
 def in_one_process(config: RunConfig, number: int, folder: Path) -> None:
     """So many runs, one after the other."""
-    from dataclasses import replace
-
     for seed in range(number):
         CONTROL.train(replace(config, seed=seed), folder / f"seed-{seed}")
 

@@ -40,6 +40,7 @@ __all__ = [
     "read_json",
     "read_regular",
     "read_rows",
+    "read_tail",
     "refuse_links",
     "replacing",
     "row_line",
@@ -48,6 +49,7 @@ __all__ = [
 ]
 
 _MOST_NESTED = 64
+_TAIL_BYTES = 1 << 16
 _GLANCES, _GLANCE_SECONDS = 3, 0.02
 _TEMPORARY = re.compile(r"\.tmp-[0-9a-f]{16}-(.+)")
 _SEAL = re.compile(rb',\s*"crc32": "([0-9a-f]{8})"\s*\}\s*\Z')
@@ -162,6 +164,18 @@ def read_regular(path: Path) -> bytes:
         OSError: if it cannot be read.
     """
     with open(open_regular(path, os.O_RDONLY), "rb") as file:
+        return file.read()
+
+
+def read_tail(path: Path) -> bytes:
+    """The last 64 KiB of a plain file, or all of it; it may grow meanwhile.
+
+    Raises:
+        RunFolderError: if a pipe, a device or a folder stands there.
+        OSError: if it cannot be read.
+    """
+    with open(open_regular(path, os.O_RDONLY), "rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
         return file.read()
 
 

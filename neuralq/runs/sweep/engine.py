@@ -23,7 +23,7 @@ from neuralq.runs.sweep.results import RunResult, Status, SweepResult
 from neuralq.runs.sweep.states import RunState, note_failure, saved_steps, steps_so_far
 from neuralq.runs.sweep.task import Task
 
-__all__ = ["Ended", "Engine", "run_sweep", "share_of"]
+__all__ = ["Attempts", "Ended", "Engine", "run_sweep", "share_of"]
 
 _POLL_SECONDS = 0.25
 _ELSEWHERE_SECONDS = 2.0
@@ -42,6 +42,23 @@ class Ended:
 
     task: Task
     reason: str = ""
+
+
+class Attempts:
+    """How often each run was begun again without getting further than the time before."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[int, int]] = {}
+
+    def given_up(self, ended: Ended) -> str | None:
+        """Why a run that ended before its end is not begun again; None where it is, from its newest checkpoint."""
+        name = ended.task.name
+        saved, (before, count) = saved_steps(ended.task.path), self._known.get(name, (-1, 0))
+        count = count + 1 if saved == before else 1
+        self._known[name] = (saved, count)
+        if count < _MOST_ATTEMPTS:
+            return None
+        return f"{ended.reason or 'it ended before its end'}, {_MOST_ATTEMPTS} times over"
 
 
 class Engine(Protocol):
@@ -152,7 +169,7 @@ class _Loop:
         self.by_name = {member.name: member for member in members}
         self.states: dict[str, RunState] = {}
         self.elsewhere: list[Member] = []
-        self.attempts: dict[str, tuple[int, int]] = {}
+        self.attempts = Attempts()
         self.stopping = False
         self._looked = time.monotonic()
         self._budgets = {m.name: m.total_steps or int(sweep.configuration(m)["total_steps"]) for m in members}
@@ -215,12 +232,11 @@ class _Loop:
             if state.state in ("finished", "failed") or self.stopping:
                 self._note(member, state)
                 continue
-            saved, before = saved_steps(ended.task.path), self.attempts.get(member.name, (-1, 0))
-            self.attempts[member.name] = (saved, before[1] + 1 if saved == before[0] else 1)
+            given_up = self.attempts.given_up(ended)
             if state.state == "running":  # somebody else was there first
                 self.elsewhere.append(member)
-            elif self.attempts[member.name][1] >= _MOST_ATTEMPTS:
-                self._fail(member, f"{ended.reason or 'it ended before its end'}, {_MOST_ATTEMPTS} times over")
+            elif given_up is not None:
+                self._fail(member, given_up)
             else:
                 self._note(member, state)
                 self.waiting.append(member)

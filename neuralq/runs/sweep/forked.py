@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from neuralq.runs.children import safe_path, with_environment, without_main
-from neuralq.runs.folder.files import open_regular
+from neuralq.runs.folder.files import open_regular, read_tail
 from neuralq.runs.sweep.task import Task
 
 __all__ = ["reason_of", "run_forked"]
@@ -28,7 +28,6 @@ __all__ = ["reason_of", "run_forked"]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _GRACE_SECONDS = 120
 """That a run has to save once the process that asked for it is gone."""
-_TAIL_BYTES = 1 << 16
 
 
 def run_forked(
@@ -87,8 +86,7 @@ def reason_of(status: int, log: Path) -> str:
     if status <= 0:
         return f"killed by {signal.Signals(-status).name}" if status else ""
     lines: list[str] = []
-    with contextlib.suppress(OSError), open(open_regular(log, os.O_RDONLY), "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-        lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+    with contextlib.suppress(OSError):
+        lines = [line for line in read_tail(log).decode(errors="replace").splitlines() if line.strip()]
     said = lines[-1].strip().removeprefix("neuralq: ").removeprefix("error: ") if lines else ""
     return said or f"ended with status {status}"

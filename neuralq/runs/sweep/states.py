@@ -20,6 +20,7 @@ from neuralq.runs.folder.files import (
     open_regular,
     parse_json,
     read_json,
+    read_tail,
     refuse_links,
     to_json,
     write_durably,
@@ -41,7 +42,6 @@ __all__ = [
 
 FAILURE = "failure.json"
 _NUMBER = re.compile(r"[1-9][0-9]*")
-_TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,7 @@ def steps_so_far(run_dir: Path) -> int:
     if not run_dir.is_dir():
         return next((steps_so_far(attempt) for attempt in numbered(attempts_path(run_dir))), 0)
     try:
-        with open(open_regular(run_dir / "metrics.jsonl", os.O_RDONLY), "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-            *_, last, _ = [b"", *file.read().split(b"\n")]
-            return int(parse_json(last)["env_steps"])
+        *_, last, _ = [b"", *read_tail(run_dir / "metrics.jsonl").split(b"\n")]
+        return int(parse_json(last)["env_steps"])
     except (RunFolderError, OSError, ValueError, KeyError, TypeError, OverflowError):
         return 0

@@ -33,12 +33,12 @@ def perform(task: Task) -> None:
     forget_failure(task.path)
     try:
         with _hooks(task) as hooks, _warnings():
-            take_over(task.path, int(task.config["total_steps"]))
+            budget = int(task.config["total_steps"])
+            take_over(task.path, budget)
             if not is_run_folder(task.path):
                 CONTROL.train(config_from_dict(task.config), task.path, hooks)
             else:
-                budget, changes = int(task.config["total_steps"]), _moved(task)
-                CONTROL.resume(task.path, budget, hooks, changes)
+                CONTROL.resume(task.path, budget, hooks, _moved(task))
     except RunFolderBusy as error:
         print(f"neuralq: {error}", file=sys.stderr)
     except Exception as error:

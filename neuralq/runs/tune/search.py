@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from neuralq.runs.folder.files import RunFolderError
 from neuralq.runs.stop_request import StopRequest
-from neuralq.runs.sweep.engine import Ended, Engine
-from neuralq.runs.sweep.states import saved_steps, state_of
+from neuralq.runs.sweep.engine import Attempts, Ended, Engine
+from neuralq.runs.sweep.states import state_of
 from neuralq.runs.tune.asking import choose
 from neuralq.runs.tune.confirming import CANDIDATES, best_so_far, candidates
 from neuralq.runs.tune.study import FRESH, Study
@@ -22,7 +22,6 @@ from neuralq.runs.tune.trials import Outcome, Trial, outcome_of
 __all__ = ["Limits", "Progress", "StudyFailed", "tune"]
 
 _POLL_SECONDS = 0.25
-_MOST_ATTEMPTS = 3
 _CONFIRMING = 0.5
 """Of a time limit, at most, is kept aside for the confirmation."""
 _MARGIN = 1.2
@@ -113,7 +112,7 @@ class _Loop:
         self.study, self.limits, self.request, self.watch, self.clock = study, limits, request, watch, clock
         self.began = clock()
         self.at_work: dict[str, tuple[Trial, int, float | None]] = {}
-        self.attempts: dict[str, tuple[int, int]] = {}
+        self.attempts = Attempts()
         self.side_by_side = 1
         self.is_exhausted = False
 
@@ -251,11 +250,8 @@ class _Loop:
         state = state_of(ended.task.path, int(ended.task.config["total_steps"]))
         outcome = outcome_of(state, None if begun is None else self.clock() - begun)
         if outcome is None and not stopping:  # killed, or out of memory: again, from its newest checkpoint
-            saved, before = saved_steps(ended.task.path), self.attempts.get(ended.task.name, (-1, 0))
-            count = before[1] + 1 if saved == before[0] else 1
-            self.attempts[ended.task.name] = (saved, count)
-            if count >= _MOST_ATTEMPTS:
-                outcome = Outcome(None, f"{ended.reason or 'it ended before its end'}, {_MOST_ATTEMPTS} times over")
+            given_up = self.attempts.given_up(ended)
+            outcome = None if given_up is None else Outcome(None, given_up)
         if outcome is not None:
             self.study.note(trial, seed, outcome)
 
